@@ -1,0 +1,96 @@
+# Works on a bare clone: needs Python 3.10 or newer with venv, bash and make, and on the first run the network.
+
+PYTHON ?= python3
+SLICES ?= 30
+DEMO_OUTPUT ?= build/demo.png
+PYTEST_ARGS ?=
+BENCH_ARGS ?=
+
+SHELL := bash
+# Not -u: colcon's setup.bash reads variables that nobody has set.
+.SHELLFLAGS := -eo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+# Libraries of another ROS 2 must not be mixed with those in .venv, be it an installation that was sourced or the wheels
+# of another environment, which pass a guard variable on to their children.
+ifneq ($(_ROS_WHEELS_BOOTSTRAP_COMPLETE)$(AMENT_PREFIX_PATH),)
+unexport LD_LIBRARY_PATH
+endif
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH
+unexport PYTHONPATH PYTHONHOME ROS_DISTRO RMW_IMPLEMENTATION
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+# A stamp is written when its step has succeeded, so a step that was interrupted is done again.
+INSTALLED := .venv/.installed
+LINKED := .venv/.linked
+BUILT := install/.built
+CATPHAN := .cache/catphan/.complete
+
+EXECUTABLES := install/stereoreg_ros/lib/stereoreg_ros
+# Folders count too: theirs is the date that changes when a file is removed.
+SOURCES := $(shell find stereoreg_ros config launch resource -name __pycache__ -prune -o -print 2>/dev/null) \
+           setup.py setup.cfg package.xml LICENSE
+# The wheels' own packages are found under .venv. Nobody else on the network is to hear a demonstration or a test.
+WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; \
+            source install/setup.bash;
+
+.PHONY: help venv demo test lint bench catphan clean distclean
+
+help:
+	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
+	@echo 'make demo       simulated scanner and registration as two processes; SLICES=$(SLICES) DEMO_OUTPUT=$(DEMO_OUTPUT)'
+	@echo 'make test       all tests; PYTEST_ARGS="-k word" to choose'
+	@echo 'make lint       style and types'
+	@echo 'make bench      measurements'
+	@echo 'make clean      remove what was built; make distclean: .venv and downloads too'
+	@echo 'PYTHON=python3.12 make venv   chooses the Python of a new .venv'
+
+venv: $(LINKED) $(BUILT)
+
+$(INSTALLED): requirements.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "make: expected Python 3.10 or newer," \
+	    "found PYTHON=$(PYTHON): $$($(PYTHON) --version 2>&1); name another with PYTHON=..." >&2; exit 1; }
+	@echo 'Setting up .venv: about 800 MB on disk, a minute or two'
+	$(PYTHON) -m venv --clear .venv
+	.venv/bin/python -m pip install --quiet --requirement requirements.txt
+	@touch $@
+
+$(LINKED): $(INSTALLED) setup.py setup.cfg
+	.venv/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# From nothing, so that a removed module is not found in an old build.
+$(BUILT): $(INSTALLED) $(SOURCES) | $(LINKED)
+	rm -rf build/stereoreg_ros install
+	.venv/bin/colcon build --paths . --event-handlers console_direct- console_stderr+
+	@touch $@
+
+catphan: $(CATPHAN)
+
+$(CATPHAN): test/fetch_catphan.py | $(INSTALLED)
+	.venv/bin/python test/fetch_catphan.py $(@D)
+	@touch $@
+
+demo: venv
+	@mkdir -p '$(dir $(DEMO_OUTPUT))'
+	$(WITH_ROS) $(EXECUTABLES)/demo_report --slices $(SLICES) --output '$(DEMO_OUTPUT)'
+
+test: venv catphan
+	$(WITH_ROS) .venv/bin/python -m pytest $(PYTEST_ARGS)
+
+lint: $(INSTALLED)
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+bench: venv
+	.venv/bin/python -m benchmarks $(BENCH_ARGS)
+
+clean:
+	rm -rf build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf .venv .cache
