@@ -1,0 +1,1 @@
+"""What everything else is said in: poses, frames of rods, slices, and the projection that links them."""

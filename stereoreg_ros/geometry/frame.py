@@ -1,0 +1,92 @@
+"""The stereotactic frame: straight rods of finite length, as bounded Pluecker lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereoreg_ros.geometry.pose import Array
+
+MIN_LINES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Rods of a stereotactic frame, in the frame's own axes (Maurin 2009, section 2.2).
+
+    name: the frame's name; line_names: n distinct names; starts, ends: (n, 3) in mm, the rods' ends;
+    diameters: (n,) in mm.
+
+    Derived, each with one row a rod: directions y (n, 3), unit; origins o (n, 3) mm, the line's point nearest
+    the frame's origin; moments w = y x o (n, 3) mm, the Pluecker moment in the paper's order, so that
+    y x p = w for every p on the line; lambda_min, lambda_max (n,) mm, the rod's ends as positions along y from o.
+
+    Raises ValueError on fewer than three rods, names that repeat, ends that coincide or are not finite.
+    """
+
+    name: str
+    line_names: tuple[str, ...]
+    starts: Array
+    ends: Array
+    diameters: Array
+    directions: Array = field(init=False)
+    origins: Array = field(init=False)
+    moments: Array = field(init=False)
+    lambda_min: Array = field(init=False)
+    lambda_max: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        names = tuple(self.line_names)
+        starts = np.array(self.starts, dtype=np.float64)
+        ends = np.array(self.ends, dtype=np.float64)
+        diameters = np.array(self.diameters, dtype=np.float64)
+        n = len(names)
+        if n < MIN_LINES:
+            raise ValueError(f"frame '{self.name}' has {n} lines, expected at least {MIN_LINES}")
+        for label, array, shape in (
+            ("starts", starts, (n, 3)),
+            ("ends", ends, (n, 3)),
+            ("diameters", diameters, (n,)),
+        ):
+            if array.shape != shape:
+                raise ValueError(f"frame '{self.name}': {label} has shape {array.shape}, expected {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"frame '{self.name}': {label} must be finite")
+        if len(set(names)) != n:
+            repeated = sorted({name for name in names if names.count(name) > 1})
+            raise ValueError(f"frame '{self.name}' names lines twice: {', '.join(repeated)}")
+        if (diameters <= 0).any():
+            raise ValueError(f"frame '{self.name}': diameters must be positive, found {diameters.min():g}")
+        span = ends - starts
+        length = np.linalg.norm(span, axis=1)
+        if (length < 1e-6).any():
+            raise ValueError(f"frame '{self.name}': line '{names[int(length.argmin())]}' has no length")
+        directions = span / length[:, None]
+        lambda_min = np.einsum("ij,ij->i", directions, starts)
+        origins = starts - lambda_min[:, None] * directions
+        derived = {
+            "line_names": names,
+            "starts": starts,
+            "ends": ends,
+            "diameters": diameters,
+            "directions": directions,
+            "origins": origins,
+            "moments": np.cross(directions, origins),
+            "lambda_min": lambda_min,
+            "lambda_max": lambda_min + length,
+        }
+        for key, value in derived.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, key, value)
+
+    def __len__(self) -> int:
+        return len(self.line_names)
+
+    def points(self, lines: NDArray[np.intp] | Sequence[int] | slice, lambdas: Array) -> Array:
+        """Points (..., 3) in mm at positions `lambdas` (...) along the chosen lines."""
+        points: Array = self.origins[lines] + np.asarray(lambdas)[..., None] * self.directions[lines]
+        return points

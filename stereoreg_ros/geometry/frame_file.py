@@ -1,0 +1,153 @@
+"""Frames from YAML files; every fault is told with file, line and key."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from stereoreg_ros.geometry.frame import MIN_LINES, Frame
+
+_MAX_BYTES = 1_000_000
+_MAX_LINES = 1000
+
+
+class FrameFileError(ValueError):
+    """A frame file that cannot be used; the text names file, line and key, what was found and what was expected."""
+
+
+def load_frame(source: str | os.PathLike[str]) -> Frame:
+    """Frame from a YAML file, or a shipped frame by its name, such as `cube6`. Lengths in mm.
+
+    A source without a folder and without an ending is a name; anything else is a path.
+    Raises FrameFileError where the file is missing or wrong in any way.
+    """
+    path = Path(source)
+    if path.suffix == "" and path.name == os.fspath(source) and not path.is_file():
+        shipped = shipped_frames()
+        if path.name not in shipped:
+            raise FrameFileError(
+                f"frame '{source}' is neither a file nor a shipped frame; shipped are: {', '.join(sorted(shipped))}"
+            )
+        path = shipped[path.name]
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise FrameFileError(f"{path}: cannot be read: {error.strerror}") from None
+    if len(content) > _MAX_BYTES:
+        raise FrameFileError(f"{path}: is longer than {_MAX_BYTES} bytes, expected a frame file")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise FrameFileError(f"{path}: is not UTF-8 text, expected YAML") from None
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise FrameFileError(f"{path}, line {line}: is not valid YAML: {error.reason}") from None
+    except (yaml.YAMLError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise FrameFileError(f"{path}{where}: is not valid YAML: {getattr(error, 'problem', error)}") from None
+    return _Reader(path).frame(root)
+
+
+def shipped_frames() -> dict[str, Path]:
+    """The frame files that come with the package, by name."""
+    here = Path(__file__).resolve()
+    # An installed package has its data under <prefix>/share; a source tree has config/ beside the package.
+    for base in here.parents:
+        for folder in (base / "share" / "stereoreg_ros" / "config" / "frames", base / "config" / "frames"):
+            if folder.is_dir():
+                return {path.stem: path for path in folder.glob("*.yaml")}
+    return {}
+
+
+class _Reader:
+    """Turns YAML nodes, which still know their lines, into a Frame."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def fault(self, node: yaml.Node | None, key: str, found: str, expected: str) -> FrameFileError:
+        where = f"line {node.start_mark.line + 1}, " if node is not None else ""
+        return FrameFileError(f"{self.path}: {where}{key}: found {found}, expected {expected}")
+
+    def frame(self, root: yaml.Node | None) -> Frame:
+        entries = self.mapping(root, "frame file", required=("name", "lines"))
+        name = self.text(entries["name"], "name")
+        lines = entries["lines"]
+        if not isinstance(lines, yaml.SequenceNode):
+            raise self.fault(lines, "lines", _kind(lines), "a list of rods")
+        if not MIN_LINES <= len(lines.value) <= _MAX_LINES:
+            expected = f"at least {MIN_LINES} and at most {_MAX_LINES} rods"
+            raise self.fault(lines, "lines", f"{len(lines.value)} rods", expected)
+        names: list[str] = []
+        starts, ends, diameters = [], [], []
+        for number, node in enumerate(lines.value):
+            key = f"lines[{number}]"
+            rod = self.mapping(node, key, required=("name", "from", "to", "diameter"))
+            rod_name = self.text(rod["name"], f"{key}.name")
+            if rod_name in names:
+                raise self.fault(rod["name"], f"{key}.name", f"'{rod_name}' a second time", "distinct names")
+            start, end = self.point(rod["from"], f"{key}.from"), self.point(rod["to"], f"{key}.to")
+            if np.linalg.norm(np.subtract(end, start)) < 1e-6:
+                raise self.fault(rod["to"], f"{key}.to", "the same point as 'from'", "a rod with a length")
+            diameter = self.number(rod["diameter"], f"{key}.diameter")
+            if diameter <= 0:
+                raise self.fault(rod["diameter"], f"{key}.diameter", f"{diameter:g}", "a positive length in mm")
+            names.append(rod_name)
+            starts.append(start)
+            ends.append(end)
+            diameters.append(diameter)
+        return Frame(name, tuple(names), np.array(starts), np.array(ends), np.array(diameters))
+
+    def mapping(self, node: yaml.Node | None, key: str, required: tuple[str, ...]) -> dict[str, yaml.Node]:
+        expected = f"the keys {', '.join(required)}"
+        if not isinstance(node, yaml.MappingNode):
+            raise self.fault(node, key, _kind(node), expected)
+        entries: dict[str, yaml.Node] = {}
+        for key_node, value in node.value:
+            name = key_node.value if isinstance(key_node, yaml.ScalarNode) else _kind(key_node)
+            if name not in required:
+                raise self.fault(key_node, key, f"unknown key '{name}'", expected)
+            if name in entries:
+                raise self.fault(key_node, key, f"key '{name}' a second time", expected)
+            entries[name] = value
+        missing = [name for name in required if name not in entries]
+        if missing:
+            raise self.fault(node, key, f"no key '{missing[0]}'", expected)
+        return entries
+
+    def text(self, node: yaml.Node, key: str) -> str:
+        if not isinstance(node, yaml.ScalarNode) or not str(node.value).strip():
+            raise self.fault(node, key, _kind(node), "a name")
+        return str(node.value)
+
+    def number(self, node: yaml.Node, key: str) -> float:
+        try:
+            if not isinstance(node, yaml.ScalarNode):
+                raise ValueError
+            value = float(node.value)
+        except ValueError:
+            raise self.fault(node, key, _kind(node), "a number in mm") from None
+        if not np.isfinite(value) or abs(value) > 1e5:
+            raise self.fault(node, key, f"{value:g}", "a finite number in mm, at most 1e5")
+        return value
+
+    def point(self, node: yaml.Node, key: str) -> list[float]:
+        if not isinstance(node, yaml.SequenceNode) or len(node.value) != 3:
+            found = f"{len(node.value)} numbers" if isinstance(node, yaml.SequenceNode) else _kind(node)
+            raise self.fault(node, key, found, "three numbers [x, y, z] in mm")
+        return [self.number(child, f"{key}[{axis}]") for child, axis in zip(node.value, "xyz", strict=True)]
+
+
+def _kind(node: yaml.Node | None) -> str:
+    if node is None:
+        return "an empty file"
+    if isinstance(node, yaml.ScalarNode):
+        return f"'{node.value}'" if node.value else "nothing"
+    return "a list" if isinstance(node, yaml.SequenceNode) else "a mapping"
