@@ -1,0 +1,1 @@
+"""Which spot is which rod, with false spots and missing rods."""

@@ -1,0 +1,100 @@
+"""In which order triples of rods are tried: well-conditioned ones first, and so that missing rods are soon covered."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import combinations
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array
+
+_PLANES = 400
+# Below this share of the best triple's quality a triple determines no pose (coplanar or all parallel rods).
+_USELESS = 1e-3
+_MOST_SUBSETS = 50_000
+
+
+class RankedTriple(NamedTuple):
+    """A triple of rods, and what has been covered once it and all before it were tried.
+
+    complete_from: every set of at least so many rods that any triple can solve holds a triple tried by then.
+    """
+
+    lines: tuple[int, int, int]
+    complete_from: int
+
+
+@lru_cache(maxsize=64)
+def triple_order(frame: Frame, min_inliers: int) -> tuple[RankedTriple, ...]:
+    """Triples of the frame's rods in the order to try them, until sets of `min_inliers` rods are covered.
+
+    After the first triple every slice with all rods is covered; greedily the fewest further triples are taken until
+    every set of one rod less holds a triple, then of two less, and so on.
+    """
+    n = len(frame)
+    quality = _qualities(frame)
+    usable = {t: q for t, q in quality.items() if q > _USELESS * max(quality.values())}
+    masks = {t: sum(1 << line for line in t) for t in usable}
+    left = sorted(usable, key=lambda t: -usable[t])
+    order: list[RankedTriple] = []
+    for size in range(n, min_inliers - 1, -1):
+        if comb(n, size) > _MOST_SUBSETS:
+            order += [RankedTriple(t, size + 1) for t in left[:-1]] + [RankedTriple(t, min_inliers) for t in left[-1:]]
+            return tuple(order)
+        subsets = np.array([sum(1 << line for line in subset) for subset in combinations(range(n), size)])
+        taken = np.array([masks[entry.lines] for entry in order], dtype=np.int64)
+        open_sets = subsets[~((subsets[:, None] & taken) == taken).any(axis=1)]
+        while open_sets.size and left:
+            covers = [int(((open_sets & masks[t]) == masks[t]).sum()) for t in left]
+            best = max(range(len(left)), key=lambda i: (covers[i], usable[left[i]]))
+            if covers[best] == 0:
+                break  # What is left open, no usable triple can solve.
+            chosen = left.pop(best)
+            open_sets = open_sets[(open_sets & masks[chosen]) != masks[chosen]]
+            order.append(RankedTriple(chosen, size + 1))
+        if order:
+            order[-1] = order[-1]._replace(complete_from=size)
+    return tuple(order)
+
+
+def _qualities(frame: Frame) -> dict[tuple[int, int, int], float]:
+    """How well each triple of rods fixes the pose, over slices that may meet the frame.
+
+    For one slice: the smallest singular value of the distances' derivatives by the positions along the rods, times
+    how far the three cuts are from collinear; nothing where a rod is not cut. The mean over slices.
+    """
+    rng = np.random.default_rng(0)  # a fixed sample: the order must not change from run to run
+    points = np.concatenate([frame.starts, frame.ends])
+    low, high = points.min(axis=0), points.max(axis=0)
+    normals = rng.normal(size=(_PLANES, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    through = low + (high - low) * rng.random((_PLANES, 3))
+    along = normals @ frame.directions.T
+    along = np.where(np.abs(along) < 1e-9, 1e-9, along)
+    lambdas = (np.einsum("pi,pi->p", normals, through)[:, None] - normals @ frame.origins.T) / along
+    inside = (lambdas >= frame.lambda_min) & (lambdas <= frame.lambda_max)
+    cuts = frame.origins + lambdas[..., None] * frame.directions
+    return {t: _quality(cuts, inside, frame.directions, t) for t in combinations(range(len(frame)), 3)}
+
+
+def _quality(cuts: Array, inside: Array, directions: Array, triple: tuple[int, int, int]) -> float:
+    visible = inside[:, triple].all(axis=1)
+    if not visible.any():
+        return 0.0
+    points = cuts[visible][:, triple]
+    jacobian = np.zeros((len(points), 3, 3))
+    sides = []
+    for row, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+        difference = points[:, a] - points[:, b]
+        length = np.linalg.norm(difference, axis=1)
+        sides.append(length)
+        jacobian[:, row, a] = difference @ directions[triple[a]] / length
+        jacobian[:, row, b] = -difference @ directions[triple[b]] / length
+    weakest = np.linalg.svd(jacobian, compute_uv=False)[:, 2]
+    twice_area = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1)
+    flatness = twice_area / np.max(sides, axis=0) ** 2
+    return float((weakest * flatness).sum() / len(cuts))

@@ -1,0 +1,1 @@
+"""Rods and spots known: which pose, which scale. Each solver in its own file."""
