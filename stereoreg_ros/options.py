@@ -1,0 +1,67 @@
+"""What a registration can be told: one table for the Python call, the command line and the node's parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Final
+
+import numpy as np
+
+from stereoreg_ros.geometry.pose import rotation_from_quaternion
+
+MATCHERS: Final = ("three_line",)
+
+
+def _option(default: Any, description: str, low: float | None = None, high: float | None = None) -> Any:
+    return field(default=default, metadata={"description": description, "low": low, "high": high})
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """How to find and judge a registration; the fields are the node's parameters of the same names.
+
+    Raises ValueError, naming the field, what was found and what was expected.
+    """
+
+    threshold: float = _option(2000.0, "HU above which a pixel may belong to a rod's spot", -32768.0, 65535.0)
+    min_spot_area_mm2: float = _option(0.5, "smallest area of a spot, mm^2", 0.0, 1000.0)
+    max_spot_area_mm2: float = _option(80.0, "largest area of a spot, mm^2", 0.01, 10000.0)
+    spot_noise_px: float = _option(0.3, "standard deviation per axis of a spot's centre, pixel", 0.001, 10.0)
+    min_inliers: int = _option(4, "fewest rods that must have a spot", 4, 1000)
+    matcher: str = _option("three_line", f"how spots are matched to rods: {' | '.join(MATCHERS)}")
+    max_log10_false_alarms: float = _option(
+        -6.0, "log10 of the number of such matches that chance may bring before a pose is refused", -300.0, 0.0
+    )
+    nominal_orientation: tuple[float, float, float, float] = _option(
+        (0.0, 0.0, 0.0, 1.0), "how the frame roughly stands in the scanner: quaternion x, y, z, w"
+    )
+    max_rotation_deg: float = _option(
+        180.0, "largest angle from the nominal orientation, degrees; 180: nothing is known", 0.1, 180.0
+    )
+    max_position_std_mm: float = _option(
+        10.0, "largest standard deviation of the frame origin's position along its worst axis, mm", 0.001, 1000.0
+    )
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            low, high = entry.metadata["low"], entry.metadata["high"]
+            value = getattr(self, entry.name)
+            if low is None:
+                continue
+            number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+            if not number or not low <= value <= high:
+                raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}")
+        if int(self.min_inliers) != self.min_inliers:
+            raise ValueError(f"min_inliers is {self.min_inliers!r}, expected a whole number")
+        if self.matcher not in MATCHERS:
+            raise ValueError(f"matcher is {self.matcher!r}, expected one of {', '.join(MATCHERS)}")
+        if self.min_spot_area_mm2 >= self.max_spot_area_mm2:
+            raise ValueError(
+                f"min_spot_area_mm2 is {self.min_spot_area_mm2:g}, expected less than "
+                f"max_spot_area_mm2, which is {self.max_spot_area_mm2:g}"
+            )
+        try:
+            rotation_from_quaternion(self.nominal_orientation)
+        except ValueError as error:
+            raise ValueError(f"nominal_orientation: {error}") from None
+        object.__setattr__(self, "nominal_orientation", tuple(float(q) for q in self.nominal_orientation))

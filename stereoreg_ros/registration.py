@@ -1,0 +1,182 @@
+"""Slice in, pose or refusal out. The file to read first.
+
+slice -> spots (`spots`) -> matches (`matching`) -> pose (`solvers`) -> how far to believe it (`uncertainty`) -> here:
+accepted, or refused with a reason.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import gammaincc
+
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_from_quaternion
+from stereoreg_ros.geometry.projection import point_line_distances, project
+from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.three_line import Spots, match
+from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
+from stereoreg_ros.spots import find_spots
+from stereoreg_ros.uncertainty import in_scanner_axes
+
+MAX_SPOTS = 300
+# Rotation (standard deviation about the weakest axis) beyond which a pose counts as not determined.
+_DEGENERATE_ROTATION_DEG = 10.0
+# Probabilities of a residual as large by the stated noise alone: less than these, and it is not the noise.
+_IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
+_LEAST_AREA_MM2 = 100.0
+# Standard deviations beyond which a pose is accepted with a caution.
+_WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 1.0, 1.0
+
+
+def register_slice(ct_slice: Slice, frame: Frame, options: RegistrationOptions | None = None) -> Registration | Refusal:
+    """Register `frame` from one slice: scanner_from_frame in mm, or a refusal with its reason."""
+    options = options or RegistrationOptions()
+    spots_px = find_spots(ct_slice, options)
+    return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice)
+
+
+def register_spots(
+    spots_px: ArrayLike,
+    frame: Frame,
+    scale: PixelScale,
+    options: RegistrationOptions | None = None,
+    scanner_from_slice: Pose | None = None,
+) -> Registration | Refusal:
+    """Register `frame` from the centres of bright spots (n, 2) in pixel (u, v), false ones among them.
+
+    scanner_from_slice: where the slice lies in the scanner; by default the scanner is the slice.
+    Raises ValueError where the spots are not of shape (n, 2) or not finite.
+    """
+    options = options or RegistrationOptions()
+    scanner_from_slice = scanner_from_slice or Pose.identity()
+    spots_px = np.asarray(spots_px, dtype=np.float64)
+    if spots_px.size == 0:
+        spots_px = spots_px.reshape(0, 2)
+    if spots_px.ndim != 2 or spots_px.shape[1] != 2:
+        raise ValueError(f"spots_px has shape {spots_px.shape}, expected (n, 2)")
+    if not np.isfinite(spots_px).all():
+        raise ValueError("spots_px must be finite")
+
+    def refuse(reason: Reason, message: str, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
+        return Refusal(frame, scale, spots_px, reason, message, estimates)
+
+    count = len(spots_px)
+    if count < options.min_inliers:
+        return refuse("too_few_spots", f"{count} spots found, at least {options.min_inliers} are needed")
+    if count > MAX_SPOTS:
+        return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
+
+    spots = _prepare(spots_px, scale, options.spot_noise_px)
+    nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
+    hypotheses = match(spots, frame, nominal, options)
+    estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in hypotheses)
+    if not estimates:
+        return refuse(
+            "no_consensus", f"no pose puts {options.min_inliers} of the {len(frame)} rods on any of the {count} spots"
+        )
+    best = estimates[0]
+    if best.log10_false_alarms > options.max_log10_false_alarms:
+        return refuse(
+            "no_consensus",
+            f"chance alone would bring 10^{best.log10_false_alarms:.1f} matches as good as the best one, of "
+            f"{best.inliers} rods among {count} spots; at most 10^{options.max_log10_false_alarms:g} are allowed",
+            estimates,
+        )
+    plausibility = float(gammaincc(best.degrees_of_freedom / 2, best.chi_square / 2))
+    if plausibility < _IMPLAUSIBLE:
+        return refuse(
+            "inaccurate",
+            f"the residual of {best.residual_rms_px:.2f} pixel RMS over {best.inliers} rods cannot come from a spot "
+            f"noise of {options.spot_noise_px:g} pixel: wrong pixel spacing, frame or noise",
+            estimates,
+        )
+    if len(estimates) > 1:
+        return refuse("ambiguous", _describe_ambiguity(estimates), estimates)
+    if best.rotation_std_deg > _DEGENERATE_ROTATION_DEG:
+        axis = np.linalg.eigh(best.covariance[3:, 3:])[1][:, -1]
+        return refuse(
+            "degenerate",
+            f"the rotation about the axis {np.round(axis, 2).tolist()} of the scanner is known only to "
+            f"{best.rotation_std_deg:.1f} degrees",
+            estimates,
+        )
+    if best.position_std_mm > options.max_position_std_mm:
+        return refuse(
+            "inaccurate",
+            f"the position has a standard deviation of {best.position_std_mm:.2f} mm, "
+            f"at most {options.max_position_std_mm:g} mm are allowed",
+            estimates,
+        )
+    cautions = []
+    if plausibility < _DOUBTFUL:
+        cautions.append(
+            f"the residual of {best.residual_rms_px:.2f} pixel RMS is large for a spot noise of "
+            f"{options.spot_noise_px:g} pixel"
+        )
+    if best.position_std_mm > _WEAK_POSITION_MM or best.rotation_std_deg > _WEAK_ROTATION_DEG:
+        cautions.append(
+            f"weakly determined: standard deviation {best.position_std_mm:.1f} mm, {best.rotation_std_deg:.1f} degrees"
+        )
+    caution = "; ".join(cautions)
+    return Registration(frame, scale, options, spots_px, best, caution)
+
+
+def _prepare(spots_px: Array, scale: PixelScale, noise_px: float) -> Spots:
+    mm = scale.to_mm(spots_px)
+    hull = cv2.convexHull(mm.astype(np.float32))
+    return Spots(
+        mm=mm,
+        whitening=scale.inverse_matrix / noise_px,
+        sigma_mm=noise_px * max(scale.sx, scale.sy),
+        variance_mm2=noise_px**2 * scale.sx * scale.sy,
+        area_mm2=max(float(cv2.contourArea(hull)), _LEAST_AREA_MM2),
+    )
+
+
+def _estimate(
+    hypothesis: Hypothesis, spots_px: Array, frame: Frame, scale: PixelScale, scanner_from_slice: Pose
+) -> PoseEstimate:
+    slice_from_frame = Pose(hypothesis.rotation, hypothesis.translation)
+    predicted_px, _ = project(frame, slice_from_frame, scale)
+    lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
+    spots = hypothesis.spot_of_line[lines]
+    distances = point_line_distances(frame, lines, slice_from_frame, scale.to_mm(spots_px[spots]))
+    return PoseEstimate(
+        slice_from_frame=slice_from_frame,
+        scanner_from_frame=scanner_from_slice @ slice_from_frame,
+        covariance=in_scanner_axes(_covariance(hypothesis.information), scanner_from_slice),
+        matches=tuple(
+            Match(frame.line_names[line], int(line), int(spot), spots_px[spot], predicted_px[line], float(distance))
+            for line, spot, distance in zip(lines, spots, distances, strict=True)
+        ),
+        chi_square=hypothesis.chi_square,
+        log10_false_alarms=hypothesis.log10_false_alarms,
+    )
+
+
+def _covariance(information: Array) -> Array:
+    """Inverse of an information matrix (6, 6); a direction that nothing determines gets a huge variance."""
+    values, vectors = np.linalg.eigh(information)
+    covariance: Array = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+    return covariance
+
+
+def _describe_ambiguity(estimates: tuple[PoseEstimate, ...]) -> str:
+    poses = []
+    for estimate in estimates:
+        pose = estimate.scanner_from_frame
+        position = ", ".join(f"{value:.1f}" for value in pose.translation)
+        turn = ", ".join(f"{value:.3f}" for value in pose.quaternion_xyzw)
+        poses.append(f"position ({position}) mm, quaternion ({turn}), residual {estimate.residual_rms_mm:.2f} mm")
+    more = math.inf if len(poses) > 8 else 0
+    listed = "; ".join(poses[:8]) + ("; and more" if more else "")
+    return (
+        f"{len(estimates)} poses explain the slice equally well, tell them apart by nominal_orientation and "
+        f"max_rotation_deg: {listed}"
+    )

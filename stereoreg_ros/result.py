@@ -1,0 +1,182 @@
+"""What a registration says: a pose that may be believed, or a refusal with its reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array, Pose
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.uncertainty import error_ball_95
+
+Reason = Literal["too_few_spots", "no_consensus", "ambiguous", "degenerate", "inaccurate", "bad_image", "bad_frame"]
+REASONS: Final[tuple[Reason, ...]] = (
+    "too_few_spots",
+    "no_consensus",
+    "ambiguous",
+    "degenerate",
+    "inaccurate",
+    "bad_image",
+    "bad_frame",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """One rod and its spot.
+
+    line: the rod's name; line_index: its row in the frame; spot: the spot's row in the spots given;
+    spot_px: (2,) pixel; predicted_px: (2,) pixel, where the pose has the rod cut the slice;
+    residual_mm: distance from the spot to the rod (point to line).
+    """
+
+    line: str
+    line_index: int
+    spot: int
+    spot_px: Array
+    predicted_px: Array
+    residual_mm: float
+
+    @property
+    def residual_px(self) -> float:
+        """Distance in the image from the spot to the predicted one, pixel."""
+        return float(np.linalg.norm(self.spot_px - self.predicted_px))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """One explanation of a slice: a pose with the matches it rests on.
+
+    slice_from_frame, scanner_from_frame: the pose, mm. covariance: (6, 6), position (mm) then rotation vector (rad),
+    in scanner axes, of the perturbation of `Pose.perturbed` on scanner_from_frame; this is the order of ROS.
+    chi_square: sum of the squared residuals over the noise, with `degrees_of_freedom`.
+    log10_false_alarms: log10 of how many as good explanations chance alone would bring.
+    """
+
+    slice_from_frame: Pose
+    scanner_from_frame: Pose
+    covariance: Array
+    matches: tuple[Match, ...]
+    chi_square: float
+    log10_false_alarms: float
+
+    @property
+    def inliers(self) -> int:
+        """Number of rods with a spot."""
+        return len(self.matches)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Degrees of freedom of `chi_square`."""
+        return 2 * len(self.matches) - 6
+
+    @property
+    def residual_rms_mm(self) -> float:
+        """Root mean square of the distances from spot to rod, mm."""
+        return math.sqrt(sum(match.residual_mm**2 for match in self.matches) / len(self.matches))
+
+    @property
+    def residual_rms_px(self) -> float:
+        """Root mean square of the distances in the image, pixel."""
+        return math.sqrt(sum(match.residual_px**2 for match in self.matches) / len(self.matches))
+
+    @property
+    def position_std_mm(self) -> float:
+        """Standard deviation of the frame origin's position along its worst axis, mm."""
+        return math.sqrt(max(0.0, float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1])))
+
+    @property
+    def rotation_std_deg(self) -> float:
+        """Standard deviation of the rotation about its worst axis, degrees."""
+        return math.degrees(math.sqrt(max(0.0, float(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))))
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """An accepted slice. True as a condition.
+
+    options: what it was made with; estimate: the pose and all that supports it; spots_px: (n, 2), all spots offered;
+    caution: a sentence where the pose is accepted but something deserves a look, else empty.
+    """
+
+    frame: Frame
+    scale: PixelScale
+    options: RegistrationOptions
+    spots_px: Array
+    estimate: PoseEstimate
+    caution: str = ""
+
+    def __bool__(self) -> Literal[True]:
+        return True
+
+    @property
+    def scanner_from_frame(self) -> Pose:
+        """The frame in the scanner, mm."""
+        return self.estimate.scanner_from_frame
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) covariance of scanner_from_frame; see `PoseEstimate`."""
+        return self.estimate.covariance
+
+    @property
+    def matches(self) -> tuple[Match, ...]:
+        """Which spot is which rod."""
+        return self.estimate.matches
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """A slice without a pose that may be believed. False as a condition.
+
+    reason: one of REASONS; message: one sentence with the figures that decided; estimates: the explanations that
+    were found, best first (several for `ambiguous`, none where none was found). They are for looking at, not for use.
+    """
+
+    frame: Frame
+    scale: PixelScale
+    spots_px: Array
+    reason: Reason
+    message: str
+    estimates: tuple[PoseEstimate, ...] = ()
+
+    def __bool__(self) -> Literal[False]:
+        return False
+
+
+def diagnostics(result: Registration | Refusal, calibration: str, duration_s: float) -> dict[str, str | int | float]:
+    """The diagnostic keys of the contract, in its order; a number that does not exist is NaN.
+
+    calibration: `configured` or `measured`; duration_s: seconds spent on the slice.
+    """
+    best: PoseEstimate | None
+    if result:
+        best, alternatives = result.estimate, 1
+    else:
+        best = result.estimates[0] if result.estimates else None
+        alternatives = len(result.estimates)
+    nan = math.nan
+    return {
+        "outcome": "accepted" if result else "refused",
+        "reason": "" if result else result.reason,
+        "frame": result.frame.name,
+        "spots": len(result.spots_px),
+        "lines": len(result.frame),
+        "inliers": best.inliers if best else 0,
+        "residual_rms_mm": best.residual_rms_mm if best else nan,
+        "residual_rms_px": best.residual_rms_px if best else nan,
+        "log10_false_alarms": best.log10_false_alarms if best else nan,
+        "ambiguous_poses": alternatives,
+        "position_std_mm": best.position_std_mm if best else nan,
+        "rotation_std_deg": best.rotation_std_deg if best else nan,
+        "target_error_95_mm": error_ball_95(best.covariance[:3, :3]) if best else nan,
+        "pixel_spacing_x_mm": result.scale.sx,
+        "pixel_spacing_y_mm": result.scale.sy,
+        "calibration": calibration,
+        "duration_ms": 1e3 * duration_s,
+    }
