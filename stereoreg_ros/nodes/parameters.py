@@ -1,0 +1,158 @@
+"""The parameters of `register_node`: one table, declared from it and validated as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.options import RegistrationOptions
+
+_SPACING_RANGE_MM = (0.001, 100.0)
+
+
+class ParameterError(ValueError):
+    """A start value that a node cannot run with; the text is a sentence for whoever started it."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One parameter: its name, default, what it means, and the range of a number (None: no range)."""
+
+    name: str
+    default: Any
+    description: str
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def value(self) -> Any:
+        """The default as rclpy takes it: lists instead of tuples."""
+        return list(self.default) if isinstance(self.default, tuple) else self.default
+
+    @property
+    def descriptor(self) -> ParameterDescriptor:
+        """The description that `ros2 param describe` shows."""
+        descriptor = ParameterDescriptor(description=self.description)
+        if isinstance(self.default, tuple):
+            descriptor.additional_constraints = f"{len(self.default)} numbers"
+        elif self.low is not None and self.high is not None:
+            if isinstance(self.default, int):
+                descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high))]
+            else:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=float(self.low), to_value=float(self.high))
+                ]
+        return descriptor
+
+
+def setting(default: Any, description: str, low: float | None = None, high: float | None = None) -> Any:
+    """A dataclass field that `entries_of` makes a parameter of."""
+    return field(default=default, metadata={"description": description, "low": low, "high": high})
+
+
+def entries_of(settings: type) -> tuple[Entry, ...]:
+    """The parameters of a dataclass whose fields were made by `setting`; fields without a default are left out."""
+    return tuple(
+        Entry(entry.name, entry.default, entry.metadata["description"], entry.metadata["low"], entry.metadata["high"])
+        for entry in fields(settings)
+        if entry.default is not MISSING
+    )
+
+
+def declare(node: Node, entries: Iterable[Entry]) -> dict[str, Any]:
+    """Declare the parameters and return their start values; ParameterError on a wrong type or beyond the range."""
+    values = {}
+    for entry in entries:
+        try:
+            parameter = node.declare_parameter(entry.name, entry.value, entry.descriptor)
+        except ParameterException as error:
+            raise ParameterError(str(error)) from None
+        values[entry.name] = plain(parameter)
+    return values
+
+
+def plain(parameter: Parameter) -> Any:
+    """The value of a parameter, arrays as tuples."""
+    scalar = isinstance(parameter.value, (str, int, float, bool))
+    return parameter.value if scalar or parameter.value is None else tuple(parameter.value)
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """Everything `register_node` is told, valid as a whole.
+
+    Raises ValueError, naming the parameter, what was found and what was expected.
+    """
+
+    options: RegistrationOptions
+    frame_file: str = setting("cube6", "frame file: a path, or the name of a shipped frame")
+    pixel_spacing: tuple[float, float] = setting(
+        (0.0, 0.0), "pixel spacing [sx, sy]: between columns, between rows, mm/pixel; [0, 0]: not told yet"
+    )
+    pixel_shear: float = setting(0.0, "shear of the pixel grid, mm/pixel", -10.0, 10.0)
+    rescale_slope: float = setting(1.0, "HU = value * rescale_slope + rescale_intercept; not 0", -1e6, 1e6)
+    rescale_intercept: float = setting(0.0, "HU = value * rescale_slope + rescale_intercept", -1e6, 1e6)
+    scanner_frame_id: str = setting("", "frame_id of the scanner in all messages; empty: the image's frame_id")
+    fiducial_frame_id: str = setting("stereotactic_frame", "name of the stereotactic frame's axes in messages")
+
+    def __post_init__(self) -> None:
+        for entry in entries_of(type(self)):
+            value = getattr(self, entry.name)
+            if entry.low is not None and entry.high is not None and not entry.low <= value <= entry.high:
+                raise ValueError(f"{entry.name} is {value!r}, expected a number from {entry.low:g} to {entry.high:g}")
+        low, high = _SPACING_RANGE_MM
+        if len(self.pixel_spacing) != 2:
+            raise ValueError(f"pixel_spacing has {len(self.pixel_spacing)} numbers, expected two: [sx, sy] in mm/pixel")
+        if self.pixel_spacing != (0.0, 0.0) and not all(low <= spacing <= high for spacing in self.pixel_spacing):
+            raise ValueError(
+                f"pixel_spacing is {list(self.pixel_spacing)}, "
+                f"expected two positive numbers of mm/pixel, from {low:g} to {high:g}"
+            )
+        if self.rescale_slope == 0 or not math.isfinite(self.rescale_slope):
+            raise ValueError(f"rescale_slope is {self.rescale_slope!r}, expected a number that is not 0")
+        for name in ("frame_file", "fiducial_frame_id"):
+            if not getattr(self, name):
+                raise ValueError(f"{name} is empty, expected a name")
+
+    @classmethod
+    def from_parameters(cls, values: Mapping[str, Any]) -> NodeSettings:
+        """Settings from the values of all parameters by name."""
+        names = {entry.name for entry in entries_of(RegistrationOptions)}
+        options = {name: value for name, value in values.items() if name in names}
+        own = {name: value for name, value in values.items() if name not in names}
+        return cls(options=RegistrationOptions(**options), **own)
+
+    @property
+    def scale(self) -> PixelScale | None:
+        """The pixel scale; None until the spacing was told."""
+        return PixelScale(*self.pixel_spacing, self.pixel_shear) if self.pixel_spacing != (0.0, 0.0) else None
+
+
+ENTRIES = (*entries_of(NodeSettings), *entries_of(RegistrationOptions))
+
+
+def declare_settings(node: Node) -> NodeSettings:
+    """Declare all parameters of `register_node` and return its settings at start; raises ParameterError."""
+    values = declare(node, ENTRIES)
+    try:
+        return NodeSettings.from_parameters(values)
+    except ValueError as error:
+        raise ParameterError(str(error)) from None
+
+
+def changed_settings(node: Node, changes: Iterable[Parameter]) -> NodeSettings:
+    """The node's settings as they would be with `changes`; ValueError where they would not be valid.
+
+    Parameters that are not in the table, which rclpy declares itself, are passed over.
+    """
+    values = {entry.name: plain(node.get_parameter(entry.name)) for entry in ENTRIES}
+    values |= {parameter.name: plain(parameter) for parameter in changes if parameter.name in values}
+    return NodeSettings.from_parameters(values)
