@@ -22,6 +22,7 @@ _RED: Final = (70, 70, 255)
 _BLUE: Final = (255, 170, 60)
 _WHITE: Final = (240, 240, 240)
 _LEAST_WIDTH = 1024
+_MOST_ROWS = 4096
 _HEADER = 64
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 # Residuals are drawn so many times longer than they are: in a good registration they are a fraction of a pixel.
@@ -29,14 +30,15 @@ _RESIDUAL_MAGNIFICATION = 10
 
 
 def draw_overlay(ct_slice: Slice, result: Registration | Refusal) -> Picture:
-    """The slice in BGR (rows, columns, 3), enlarged to 1024 columns or more, under a line that says the outcome.
+    """The slice in BGR (rows, columns, 3), enlarged to 1024 columns unless it is very tall, under the outcome in words.
 
     Spots: yellow circles. Rods with a spot: green, with the rod's name and distance; the red stroke is the residual,
     ten times enlarged. Rods that should be seen and have no spot: blue crosses. A refusal shows its best explanation.
     """
     best = result.estimate if result else (result.estimates[0] if result.estimates else None)
     grey = _grey(ct_slice)
-    zoom = max(1, -(-_LEAST_WIDTH // grey.shape[1]))
+    # Wide enough to read, but a tall narrow image must not grow beyond bounds.
+    zoom = max(1, min(-(-_LEAST_WIDTH // grey.shape[1]), _MOST_ROWS // grey.shape[0]))
     large = cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
     body = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
     _annotate(body, zoom, ct_slice, result, best)

@@ -64,4 +64,5 @@ class RegistrationOptions:
             rotation_from_quaternion(self.nominal_orientation)
         except ValueError as error:
             raise ValueError(f"nominal_orientation: {error}") from None
+        object.__setattr__(self, "min_inliers", int(self.min_inliers))
         object.__setattr__(self, "nominal_orientation", tuple(float(q) for q in self.nominal_orientation))

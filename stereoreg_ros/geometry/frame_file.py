@@ -11,7 +11,7 @@ import yaml
 from stereoreg_ros.geometry.frame import MIN_LINES, Frame
 
 _MAX_BYTES = 1_000_000
-_MAX_LINES = 1000
+_MAX_LINES = 60
 
 
 class FrameFileError(ValueError):

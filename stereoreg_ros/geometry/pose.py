@@ -72,8 +72,8 @@ class Pose:
     translation: Array
 
     def __post_init__(self) -> None:
-        rotation = np.asarray(self.rotation, dtype=np.float64)
-        translation = np.asarray(self.translation, dtype=np.float64)
+        rotation = np.array(self.rotation, dtype=np.float64)
+        translation = np.array(self.translation, dtype=np.float64)
         if rotation.shape != (3, 3):
             raise ValueError(f"rotation has shape {rotation.shape}, expected (3, 3)")
         if translation.shape != (3,):

@@ -3,7 +3,7 @@
 Unknown are the positions lambda (3) at which the slice cuts the rods; the three distances between the spots are known.
 Each squared distance is a quadratic in two of them. The rods are divided into cells once; a table from distances to
 cells says which cells a triple of spots can belong to, and a few damped steps from a cell's centre reach the solution
-in it. So every solution is found, wherever the polynomial's roots lie; and where noise has pushed a double root off the
+in it, so that no starting guess is needed. Where noise has pushed a double root off the
 real axis, as parallel rods and a slice at right angles to them make normal, the steps end at the nearest point.
 """
 

@@ -1,0 +1,78 @@
+"""DICOM files for the tests: where the real ones lie, and small ones of our own, right or wrong on purpose."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+from pydicom.dataset import FileDataset, FileMetaDataset
+from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
+CATPHAN = ROOT / ".cache" / "catphan"
+SERIES_UID = generate_uid(entropy_srcs=["stereoreg_ros", "series"])
+
+
+def real(path: Path) -> Path:
+    """The path, or the test is skipped with the reason."""
+    if not path.exists():
+        pytest.skip(f"real images are not there: {path.relative_to(ROOT.parent)}")
+    return path
+
+
+def write_slice(path: Path, stored: ArrayLike, z: float = 0.0, **elements: Any) -> Path:
+    """Write a CT slice with `stored` (rows, columns) values, HU = stored - 1024, at height z in mm; returns the path.
+
+    elements: DICOM elements by keyword in place of the usual ones; None leaves one out.
+    """
+    pixels = np.asarray(stored)
+    if pixels.dtype.kind not in "iu" or pixels.dtype.itemsize > 4:
+        pixels = pixels.astype(np.uint16)
+    bits = 8 * pixels.dtype.itemsize
+    usual: dict[str, Any] = {
+        "SOPClassUID": CTImageStorage,
+        "SOPInstanceUID": generate_uid(),
+        "Modality": "CT",
+        "SeriesInstanceUID": SERIES_UID,
+        "StudyInstanceUID": generate_uid(entropy_srcs=["stereoreg_ros", "study"]),
+        "InstanceNumber": 1,
+        "ImagePositionPatient": [-10.0, -20.0, float(z)],
+        "ImageOrientationPatient": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+        "SamplesPerPixel": 1,
+        "PhotometricInterpretation": "MONOCHROME2",
+        "Rows": pixels.shape[0],
+        "Columns": pixels.shape[1],
+        "PixelSpacing": [0.5, 0.5],
+        "BitsAllocated": bits,
+        "BitsStored": bits,
+        "HighBit": bits - 1,
+        "PixelRepresentation": int(pixels.dtype.kind == "i"),
+        "RescaleIntercept": -1024.0,
+        "RescaleSlope": 1.0,
+        "PixelData": pixels.tobytes(),
+    }
+    meta = FileMetaDataset()
+    values = {keyword: value for keyword, value in {**usual, **elements}.items() if value is not None}
+    meta.MediaStorageSOPClassUID = values.get("SOPClassUID", CTImageStorage)
+    meta.MediaStorageSOPInstanceUID = values["SOPInstanceUID"]
+    meta.TransferSyntaxUID = values.pop("TransferSyntaxUID", ExplicitVRLittleEndian)
+    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    for keyword, value in values.items():
+        setattr(dataset, keyword, value)
+    _save(dataset, path)
+    return path
+
+
+def _save(dataset: FileDataset, path: Path) -> None:
+    # pydicom 3 renamed the argument, and deprecates the attributes that pydicom 2 needs.
+    if "enforce_file_format" in inspect.signature(dataset.save_as).parameters:
+        dataset.save_as(path, enforce_file_format=True)
+    else:
+        dataset.is_little_endian = True
+        dataset.is_implicit_VR = False
+        dataset.save_as(path, write_like_original=False)

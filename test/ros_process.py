@@ -1,0 +1,208 @@
+"""Support for tests over DDS: a node as a process of its own, and a client that waits with deadlines, never blindly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import rclpy
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGE = "stereoreg_ros"
+DEADLINE_S = 20.0
+_QUEUE = QoSProfile(depth=1000)
+
+# One domain per test run and nothing beyond this machine, so that neither other runs nor robots take part.
+ROS_ENVIRONMENT = {
+    "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+}
+
+T = TypeVar("T")
+
+
+def command_of(executable: str) -> list[str]:
+    """How `ros2 run` would start an executable: from the install folder here, or from a sourced workspace.
+
+    Where nothing is built, the module of this source tree runs instead.
+    """
+    place = Path("lib") / PACKAGE / executable
+    installed = REPOSITORY / "install" / PACKAGE / place
+    if installed.is_file():
+        source = 'source "$1" && shift && exec "$@"'
+        return ["bash", "-c", source, "bash", str(REPOSITORY / "install" / "setup.bash"), str(installed)]
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if prefix and (Path(prefix) / place).is_file():
+            return [str(Path(prefix) / place)]
+    return [sys.executable, "-m", f"{PACKAGE}.nodes.{executable}"]
+
+
+class NodeProcess:
+    """A node that runs in a process group of its own, its output kept in a file."""
+
+    def __init__(self, executable: str, *arguments: str, env: Mapping[str, str] | None = None) -> None:
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
+        self.name = executable
+        self._process = subprocess.Popen(
+            [*command_of(executable), *arguments],
+            cwd=REPOSITORY,
+            env={**os.environ, **ROS_ENVIRONMENT, "PYTHONUNBUFFERED": "1", **(env or {})},
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+    @property
+    def output(self) -> str:
+        """Everything the process has written so far."""
+        # Not by reading on from the file's position: the process writes at that very position.
+        descriptor = self._log.fileno()
+        return os.pread(descriptor, os.fstat(descriptor).st_size, 0).decode(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        """Whether the process is alive."""
+        return self._process.poll() is None
+
+    def stop(self, with_signal: signal.Signals = signal.SIGINT, deadline_s: float = 5.0) -> tuple[int, float]:
+        """End the process by a signal; returns its exit code and the seconds it took, AssertionError if too long."""
+        begun = time.monotonic()
+        self._process.send_signal(with_signal)
+        return self.wait(deadline_s), time.monotonic() - begun
+
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+        """Exit code of a process that ends by itself."""
+        try:
+            return self._process.wait(deadline_s)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise AssertionError(f"{self.name} did not end within {deadline_s:g} s:\n{self.output}") from None
+
+    def kill(self) -> None:
+        """End the whole process group at once."""
+        if self.running:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+
+    def close(self) -> None:
+        """Kill what still runs and let go of the output."""
+        self.kill()
+        self._log.close()
+
+
+@contextmanager
+def node_process(executable: str, *arguments: str, env: Mapping[str, str] | None = None) -> Iterator[NodeProcess]:
+    """Run a node; at the end SIGINT must end it with exit code 0. On a failure its output is printed."""
+    process = NodeProcess(executable, *arguments, env=env)
+    try:
+        yield process
+        if process.running:
+            code, _ = process.stop()
+            assert code == 0, f"{executable} ended with exit code {code}"
+    except BaseException:
+        print(f"--- output of {executable}\n{process.output}---")
+        raise
+    finally:
+        process.close()
+
+
+class RosClient:
+    """A ROS node in this process, with a context of its own, that sends, receives and calls."""
+
+    def __init__(self, name: str = "test_client", namespace: str | None = None) -> None:
+        os.environ.update(ROS_ENVIRONMENT)
+        self._context = Context()
+        rclpy.init(context=self._context)
+        with warnings.catch_warnings():
+            # The first node imports a parser of interface files that needs a module which Python is to lose.
+            warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
+            self.node = Node(
+                name, context=self._context, namespace=namespace, enable_rosout=False, start_parameter_services=False
+            )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._publishers: dict[str, Publisher] = {}
+        self._clients: dict[str, Any] = {}
+
+    def __enter__(self) -> RosClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def wait_for(self, look: Callable[[], T], what: str, deadline_s: float = DEADLINE_S) -> T:
+        """Serve ROS until `look` returns something true, and return that; AssertionError after the deadline."""
+        end = time.monotonic() + deadline_s
+        while not (found := look()):
+            left = end - time.monotonic()
+            assert left > 0, f"waited {deadline_s:g} s in vain for {what}"
+            self._executor.spin_once(timeout_sec=min(left, 0.1))
+        return found
+
+    def collect(self, message_type: type, topic: str) -> list[Any]:
+        """Subscribe; the list returned grows by every message."""
+        messages: list[Any] = []
+        subscription = self.node.create_subscription(message_type, topic, messages.append, _QUEUE)
+        self.wait_for(subscription.get_publisher_count, f"a publisher of {topic}")
+        return messages
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish, once somebody listens."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(type(message), topic, _QUEUE)
+        self.wait_for(self._publishers[topic].get_subscription_count, f"a subscriber of {topic}")
+        self._publishers[topic].publish(message)
+
+    def unpublish(self, topic: str) -> None:
+        """Withdraw as publisher of a topic."""
+        self.node.destroy_publisher(self._publishers.pop(topic))
+
+    def call(self, service_type: Any, service: str, request: Any = None, deadline_s: float = DEADLINE_S) -> Any:
+        """Call a service and return its response."""
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(service_type, service)
+        client = self._clients[service]
+        self.wait_for(client.service_is_ready, f"service {service}", deadline_s)
+        future = client.call_async(request or service_type.Request())
+        self.wait_for(future.done, f"the response of {service}", deadline_s)
+        return future.result()
+
+    def set_parameters(self, node: str, **values: Any) -> SetParametersResult:
+        """Set parameters of another node, all or none."""
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=parameters)
+        return self.call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+
+    def get_parameters(self, node: str, *names: str) -> list[Any]:
+        """Values of another node's parameters."""
+        response = self.call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=names))
+        return [parameter_value_to_python(value) for value in response.values]
+
+    def describe_parameters(self, node: str, *names: str) -> list[Any]:
+        """Descriptors of another node's parameters."""
+        request = DescribeParameters.Request(names=names)
+        return list(self.call(DescribeParameters, f"{node}/describe_parameters", request).descriptors)

@@ -1,0 +1,49 @@
+"""The demonstration, as `make demo` runs it, and that it fails when a pose is wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not there")
+
+from ros_process import ROS_ENVIRONMENT, command_of
+
+from stereoreg_ros.geometry.pose import Pose
+from stereoreg_ros.nodes.demo_report import _SliceReport, _summary
+
+
+def test_demo_registers_a_simulated_stream(tmp_path):
+    picture = tmp_path / "demo.png"
+    command = [*command_of("demo_report"), "--slices", "12", "--output", str(picture)]
+    environment = {**os.environ, **ROS_ENVIRONMENT}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "12 of 12 slices answered" in done.stdout
+    assert " 0 wrong" in done.stdout
+    image = cv2.imread(str(picture))
+    assert image is not None
+    assert image.shape[1] >= 1024
+
+
+def report(offset_mm: float) -> _SliceReport:
+    values = {"outcome": "accepted", "inliers": "6", "spots": "6", "residual_rms_mm": "0.1", "duration_ms": "9"}
+    return _SliceReport(Pose.identity(), Pose(np.eye(3), np.array([offset_mm, 0, 0])), values)
+
+
+@pytest.mark.parametrize(
+    ("reports", "count", "code", "complaint"),
+    [
+        ([report(0.1)], 1, 0, ""),
+        ([report(0.1), report(1.6)], 2, 1, "1 wrong poses were published"),
+        ([report(0.1)], 3, 1, "2 slices were not answered"),
+        ([], 1, 1, "no slice was registered"),
+    ],
+)
+def test_summary_fails_loudly(capsys, tmp_path, reports, count, code, complaint):
+    assert _summary(reports, count, tmp_path / "x.png") == code
+    assert complaint in capsys.readouterr().err

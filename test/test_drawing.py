@@ -1,0 +1,162 @@
+"""The picture: which colour is where, and that nothing makes it fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stereoreg_ros.drawing import draw_overlay
+from stereoreg_ros.geometry.frame_file import load_frame
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
+from stereoreg_ros.geometry.projection import point_line_distances, project
+from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
+
+GREEN, YELLOW, RED, BLUE = (80, 220, 80), (60, 210, 255), (70, 70, 255), (255, 170, 60)
+FRAME = load_frame("cube6")
+SCALE = PixelScale(0.5, 0.5)
+POSE = Pose(rotation_exp(np.array([0.1, -0.05, 0.3])), np.array([64.0, 60.0, 3.0]))
+MISSING = 2
+FALSE_SPOTS = np.array([[20.0, 25.0], [230.0, 220.0]])
+HEADER = 64
+
+
+def a_slice(shape: tuple[int, int] = (256, 256)) -> Slice:
+    return Slice(np.random.default_rng(1).normal(40, 20, shape).astype(np.float32), SCALE)
+
+
+def an_estimate(pose: Pose = POSE) -> tuple[PoseEstimate, Array]:
+    """All rods but one matched, half a pixel aside; and all spots."""
+    predicted, _ = project(FRAME, pose, SCALE)
+    lines = [line for line in range(len(FRAME)) if line != MISSING]
+    spots = predicted[lines] + [0.3, -0.4]
+    distances = point_line_distances(FRAME, np.array(lines), pose, SCALE.to_mm(spots))
+    matches = tuple(
+        Match(FRAME.line_names[line], line, k, spots[k], predicted[line], float(distances[k]))
+        for k, line in enumerate(lines)
+    )
+    return PoseEstimate(pose, pose, 1e-4 * np.eye(6), matches, 5.0, -20.0), np.concatenate([spots, FALSE_SPOTS])
+
+
+def accepted(pose: Pose = POSE, caution: str = "") -> Registration:
+    estimate, spots = an_estimate(pose)
+    return Registration(FRAME, SCALE, RegistrationOptions(), spots, estimate, caution)
+
+
+def count(picture: NDArray[np.uint8], colour: tuple[int, int, int], pixel: Array, zoom: int) -> int:
+    """How many pixels of the picture near a pixel of the slice have about a colour: strokes fade at their edges."""
+    u, v = np.round(pixel * zoom + (zoom - 1) / 2).astype(int)
+    reach = 6 * zoom
+    near = picture[max(v + HEADER - reach, 0) : v + HEADER + reach, max(u - reach, 0) : u + reach]
+    return int((np.abs(near.astype(int) - colour).max(axis=-1) <= 40).sum())
+
+
+class TestColours:
+    ZOOM = 4
+
+    def test_every_rod_and_spot_has_its_colour_and_no_other(self) -> None:
+        result = accepted()
+        picture = draw_overlay(a_slice(), result)
+        for match in result.matches:
+            assert count(picture, GREEN, match.spot_px, self.ZOOM) > 30
+            assert count(picture, RED, match.spot_px, self.ZOOM) > 10
+            assert count(picture, YELLOW, match.spot_px, self.ZOOM) == 0
+        for spot in FALSE_SPOTS:
+            assert count(picture, YELLOW, spot, self.ZOOM) > 30
+            assert count(picture, GREEN, spot, self.ZOOM) == 0
+        missing = project(FRAME, POSE, SCALE)[0][MISSING]
+        assert count(picture, BLUE, missing, self.ZOOM) > 30
+        assert count(picture, GREEN, missing, self.ZOOM) == 0
+
+    def test_a_rod_that_the_slice_does_not_meet_is_not_missed(self) -> None:
+        # So far along that rods end before the slice: none of them is inside.
+        estimate, spots = an_estimate()
+        away = Pose(POSE.rotation, POSE.translation + np.array([0.0, 0.0, 100.0]))
+        result = Registration(FRAME, SCALE, RegistrationOptions(), spots, replace(estimate, slice_from_frame=away))
+        picture = draw_overlay(a_slice(), result)
+        assert (np.abs(picture.astype(int) - BLUE).max(axis=-1) <= 6).sum() == 0
+
+    def test_the_headline_says_the_outcome(self) -> None:
+        good, doubtful = draw_overlay(a_slice(), accepted()), draw_overlay(a_slice(), accepted(caution="a caution"))
+        estimate, spots = an_estimate()
+        bad = draw_overlay(a_slice(), Refusal(FRAME, SCALE, spots, "ambiguous", "two poses", (estimate,)))
+        for picture, colour in ((good, GREEN), (doubtful, YELLOW), (bad, RED)):
+            # Letters are thin and anti-aliased, how much depends on OpenCV: colours count by their tint.
+            text = picture[:HEADER].reshape(-1, 3).astype(float)
+            text = text[text.max(axis=1) > 60]
+            tint = 255 * text / text.max(axis=1, keepdims=True)
+            shares = {
+                c: int((np.abs(tint - 255 * np.array(c) / max(c)).max(axis=1) <= 20).sum())
+                for c in (GREEN, YELLOW, RED)
+            }
+            assert shares.pop(colour) > 50
+            assert set(shares.values()) == {0}
+
+
+class TestPicture:
+    @pytest.mark.parametrize(
+        ("shape", "zoom"), [((256, 256), 4), ((512, 512), 2), ((300, 1024), 1), ((40, 1500), 1), ((600, 700), 2)]
+    )
+    def test_shape(self, shape: tuple[int, int], zoom: int) -> None:
+        picture = draw_overlay(a_slice(shape), accepted())
+        assert picture.dtype == np.uint8
+        assert picture.shape == (shape[0] * zoom + HEADER, shape[1] * zoom, 3)
+        assert picture.shape[1] >= 1024
+
+    @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 2), (1, 40), (2048, 2048)])
+    def test_tiny_and_large_images(self, shape: tuple[int, int]) -> None:
+        for result in (accepted(), Refusal(FRAME, SCALE, FALSE_SPOTS, "no_consensus", "none")):
+            picture = draw_overlay(a_slice(shape), result)
+            assert picture.ndim == 3
+            assert picture.shape[1] >= 1024
+
+    def test_a_refusal_without_explanation_shows_the_spots_alone(self) -> None:
+        picture = draw_overlay(a_slice(), Refusal(FRAME, SCALE, FALSE_SPOTS, "no_consensus", "none"))
+        for spot in FALSE_SPOTS:
+            assert count(picture, YELLOW, spot, 4) > 30
+        for colour in (GREEN, BLUE):
+            assert (np.abs(picture.astype(int) - colour).max(axis=-1) <= 6).sum() == 0
+
+    def test_a_refusal_without_spots(self) -> None:
+        picture = draw_overlay(a_slice(), Refusal(FRAME, SCALE, np.empty((0, 2)), "too_few_spots", "none"))
+        assert picture[HEADER:].std() > 0
+        assert (np.abs(picture.astype(int) - YELLOW).max(axis=-1) <= 6).sum() == 0
+
+    def test_a_refusal_shows_its_best_explanation(self) -> None:
+        estimate, spots = an_estimate()
+        other, _ = an_estimate(Pose(POSE.rotation, POSE.translation + np.array([30.0, 20.0, 0.0])))
+        picture = draw_overlay(a_slice(), Refusal(FRAME, SCALE, spots, "ambiguous", "two poses", (estimate, other)))
+        for match in estimate.matches:
+            assert count(picture, GREEN, match.spot_px, 4) > 30
+
+    @pytest.mark.parametrize("distance", [1e3, 1e6, 1e12])
+    def test_predictions_far_outside(self, distance: float) -> None:
+        picture = draw_overlay(a_slice(), accepted(Pose(POSE.rotation, np.array([distance, -distance, 3.0]))))
+        assert picture.shape == (256 * 4 + HEADER, 1024, 3)
+
+    def test_a_rod_within_the_slice(self) -> None:
+        estimate, spots = an_estimate()
+        frame = load_frame("leksell_ct")
+        lying = Pose(rotation_exp(np.array([np.pi / 2, 0.0, 0.0])), np.zeros(3))
+        matches = tuple(match for match in estimate.matches if match.line_index == 1)
+        result = Refusal(
+            frame, SCALE, spots, "degenerate", "-", (replace(estimate, slice_from_frame=lying, matches=matches),)
+        )
+        assert draw_overlay(a_slice(), result).shape == (256 * 4 + HEADER, 1024, 3)
+
+    def test_a_flat_image_and_one_spike(self) -> None:
+        flat = Slice(np.full((64, 64), 7.0, np.float32), SCALE)
+        assert draw_overlay(flat, accepted()).shape[2] == 3
+        spike = np.zeros((64, 64), np.float32)
+        spike[3, 4] = 60_000
+        assert draw_overlay(Slice(spike, SCALE), accepted()).shape[2] == 3
+
+    def test_leaves_the_slice_as_it_is(self) -> None:
+        ct_slice = a_slice()
+        before = ct_slice.hu.copy()
+        draw_overlay(ct_slice, accepted())
+        np.testing.assert_array_equal(ct_slice.hu, before)

@@ -1,0 +1,211 @@
+"""Frames from files: every fault says file, line and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame, shipped_frames
+
+GOOD = """\
+name: block
+lines:
+  - {name: a, from: [-10, -10, -20], to: [-10, 5, 20], diameter: 1.0}
+  - {name: b, from: [10, -10, -20], to: [5, -10, 2e1], diameter: 1.5}
+  # a comment moves the lines below it
+  - name: c
+    from: [0, 10, -20.5]
+    to: [3, 10, +20]
+    diameter: 2
+"""
+FILE = "frame under test.yaml"
+
+
+def written(folder: Path, content: str | bytes) -> Path:
+    path = folder / FILE
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def fault(path: Path) -> str:
+    with pytest.raises(FrameFileError) as caught:
+        load_frame(path)
+    assert str(caught.value).startswith(f"{path}: ") or str(caught.value).startswith(f"{path}, line ")
+    assert "\n" not in str(caught.value)
+    return str(caught.value).removeprefix(str(path))
+
+
+class TestGood:
+    def test_every_number_arrives(self, tmp_path: Path) -> None:
+        frame = load_frame(written(tmp_path, GOOD))
+        assert frame.name == "block"
+        assert frame.line_names == ("a", "b", "c")
+        np.testing.assert_array_equal(frame.starts, [[-10, -10, -20], [10, -10, -20], [0, 10, -20.5]])
+        np.testing.assert_array_equal(frame.ends, [[-10, 5, 20], [5, -10, 20], [3, 10, 20]])
+        np.testing.assert_array_equal(frame.diameters, [1, 1.5, 2])
+
+    def test_path_as_text(self, tmp_path: Path) -> None:
+        assert load_frame(str(written(tmp_path, GOOD))).name == "block"
+
+    def test_anchors_and_aliases(self, tmp_path: Path) -> None:
+        content = GOOD.replace("[-10, -10, -20]", "&corner [-10, -10, -20]").replace("[10, -10, -20]", "*corner")
+        np.testing.assert_array_equal(load_frame(written(tmp_path, content)).starts[1], [-10, -10, -20])
+
+    def test_byte_order_mark_windows_line_ends_and_accents(self, tmp_path: Path) -> None:
+        content = b"\xef\xbb\xbf" + GOOD.replace("name: a", "name: \u00e4").replace("\n", "\r\n").encode()
+        assert load_frame(written(tmp_path, content)).line_names == ("\u00e4", "b", "c")
+
+    def test_a_file_in_the_working_folder_goes_before_a_shipped_name(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "cube6").write_text(GOOD)
+        monkeypatch.chdir(tmp_path)
+        assert load_frame("cube6").name == "block"
+
+
+class TestShipped:
+    def test_what_is_shipped(self) -> None:
+        assert set(shipped_frames()) >= {"cube6", "leksell_ct", "zframe", "catphan_ctp404"}
+
+    @pytest.mark.parametrize("name", sorted(shipped_frames()))
+    def test_loads_by_name_and_by_path(self, name: str) -> None:
+        by_name, by_path = load_frame(name), load_frame(shipped_frames()[name])
+        assert by_name.name == name
+        assert by_name.line_names == by_path.line_names
+        np.testing.assert_array_equal(by_name.starts, by_path.starts)
+        np.testing.assert_array_equal(by_name.ends, by_path.ends)
+        np.testing.assert_array_equal(by_name.diameters, by_path.diameters)
+
+    @pytest.mark.parametrize("name", ["cube7", "", "Cube6"])
+    def test_unknown_name_lists_the_shipped_ones(self, name: str) -> None:
+        with pytest.raises(FrameFileError, match=f"frame '{name}' is neither a file nor a shipped frame") as caught:
+            load_frame(name)
+        assert all(shipped in str(caught.value) for shipped in shipped_frames())
+
+    def test_a_shipped_name_with_an_ending_is_a_path(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(FrameFileError, match=r"cube6\.yaml: cannot be read: No such file"):
+            load_frame("cube6.yaml")
+
+
+# Where the fault is put, the line in the file, and what the message says besides the file.
+FAULTS: dict[str, tuple[str, str, int, str]] = {
+    "no name": ("name: block\n", "", 1, "frame file: found no key 'name', expected the keys name, lines"),
+    "empty name": ("name: block", "name:", 1, "name: found nothing, expected a name"),
+    "blank name": ("name: block", "name: '  '", 1, "name: found '  ', expected a name"),
+    "name is a list": ("name: block", "name: [block]", 1, "name: found a list, expected a name"),
+    "no lines": (GOOD[GOOD.index("lines:") :], "", 1, "frame file: found no key 'lines'"),
+    "lines are empty": (GOOD[GOOD.index("lines:") :], "lines:\n", 2, "lines: found nothing, expected a list of rods"),
+    "lines are a mapping": (
+        GOOD[GOOD.index("lines:") :],
+        "lines: {a: 1}\n",
+        2,
+        "lines: found a mapping, expected a list of rods",
+    ),
+    "two lines": (
+        GOOD[GOOD.index("  - name: c") :],
+        "",
+        3,
+        "lines: found 2 rods, expected at least 3",
+    ),
+    "unknown key": ("name: block", "name: block\nunits: mm", 2, "frame file: found unknown key 'units'"),
+    "key twice": ("name: block", "name: block\nname: block2", 2, "frame file: found key 'name' a second time"),
+    "unknown key of a rod": ("diameter: 1.5", "radius: 1.5", 4, "lines[1]: found unknown key 'radius'"),
+    "key of a rod twice": (
+        "    diameter: 2",
+        "    diameter: 2\n    diameter: 3",
+        10,
+        "lines[2]: found key 'diameter' a second time",
+    ),
+    "merge key": ("    diameter: 2", "    <<: {diameter: 2}", 9, "lines[2]: found unknown key '<<'"),
+    "a list as key": ("name: block", "name: block\n[1, 2]: 3", 2, "frame file: found unknown key 'a list'"),
+    "rod without diameter": (
+        ", diameter: 1.5",
+        "",
+        4,
+        "lines[1]: found no key 'diameter', expected the keys name, from, to, diameter",
+    ),
+    "rod is a number": (
+        "  - {name: b, from: [10, -10, -20], to: [5, -10, 2e1], diameter: 1.5}",
+        "  - 5",
+        4,
+        "lines[1]: found '5', expected the keys",
+    ),
+    "rod named twice": ("  - name: c", "  - name: a", 6, "lines[2].name: found 'a' a second time"),
+    "rod without a name": ("name: b,", "name: '',", 4, "lines[1].name: found nothing, expected a name"),
+    "two coordinates": (
+        "[0, 10, -20.5]",
+        "[0, 10]",
+        7,
+        "lines[2].from: found 2 numbers, expected three numbers [x, y, z] in mm",
+    ),
+    "four coordinates": ("[3, 10, +20]", "[3, 10, 20, 1]", 8, "lines[2].to: found 4 numbers, expected three numbers"),
+    "no list of coordinates": ("[3, 10, +20]", "3 10 20", 8, "lines[2].to: found '3 10 20', expected three numbers"),
+    "text for a number": ("-20.5", "low", 7, "lines[2].from[z]: found 'low', expected a number in mm"),
+    "decimal comma": ("[0, 10, -20.5]", "['0,5', 10, 20]", 7, "lines[2].from[x]: found '0,5', expected a number"),
+    "nothing for a number": ("diameter: 2", "diameter:", 9, "lines[2].diameter: found nothing, expected a number"),
+    "list for a number": ("diameter: 1.5", "diameter: [1.5]", 4, "lines[1].diameter: found a list, expected a number"),
+    "YAML NaN": ("2e1", ".nan", 4, "lines[1].to[z]: found '.nan', expected a number"),
+    "NaN": ("2e1", "nan", 4, "lines[1].to[z]: found nan, expected a finite number"),
+    "infinite": ("2e1", "-inf", 4, "lines[1].to[z]: found -inf, expected a finite number"),
+    "overflow": ("2e1", "1e999", 4, "lines[1].to[z]: found inf, expected a finite number"),
+    "too large": ("2e1", "100001", 4, "lines[1].to[z]: found 100001, expected a finite number in mm, at most 1e5"),
+    "no thickness": ("diameter: 1.5", "diameter: 0", 4, "lines[1].diameter: found 0, expected a positive length in mm"),
+    "negative thickness": ("diameter: 2", "diameter: -2", 9, "lines[2].diameter: found -2, expected a positive"),
+    "no length": ("[3, 10, +20]", "[0, 10, -20.5]", 8, "lines[2].to: found the same point as 'from'"),
+    "broken YAML": ("diameter: 1.5}", "diameter: 1.5", 6, "is not valid YAML: expected ',' or '}', but got '-'"),
+    "tab": ("    from: [0", "\tfrom: [0", 7, "is not valid YAML"),
+    "unknown alias": ("[3, 10, +20]", "*nowhere", 8, "is not valid YAML: found undefined alias"),
+    "a second document": ("    diameter: 2\n", "    diameter: 2\n---\nname: other\n", 10, "is not valid YAML"),
+    "rods within themselves": (
+        GOOD[GOOD.index("lines:") :],
+        "lines: &rods [*rods, *rods, *rods]\n",
+        2,
+        "lines[0]: found a list, expected the keys",
+    ),
+}
+
+
+class TestFaults:
+    @pytest.mark.parametrize("case", FAULTS)
+    def test_says_line_and_key(self, case: str, tmp_path: Path) -> None:
+        old, new, line, told = FAULTS[case]
+        assert GOOD.count(old) == 1
+        message = fault(written(tmp_path, GOOD.replace(old, new)))
+        assert f"line {line}," in message or f"line {line}:" in message
+        assert told in message
+
+    @pytest.mark.parametrize(
+        ("content", "told"),
+        [
+            (b"", "frame file: found an empty file, expected the keys name, lines"),
+            (b"# only a comment\n", "frame file: found an empty file"),
+            (b"just text", "line 1, frame file: found 'just text', expected the keys"),
+            (b"- name: a\n- name: b\n", "line 1, frame file: found a list"),
+            (GOOD.encode("utf-16"), "is not UTF-8 text, expected YAML"),
+            (GOOD.replace("block", "bl\u00f6ck").encode("latin-1"), "is not UTF-8 text, expected YAML"),
+            (b"name: block\nlines: a\0b\n", ", line 2: is not valid YAML: special characters are not allowed"),
+            (b"[" * 20_000, "is not valid YAML"),
+            (GOOD.encode() + b"#" * 1_000_000, "is longer than 1000000 bytes, expected a frame file"),
+        ],
+        ids=["empty", "comment", "text", "list", "utf-16", "latin-1", "nul", "deep", "huge"],
+    )
+    def test_what_is_no_frame_file(self, content: bytes, told: str, tmp_path: Path) -> None:
+        assert told in fault(written(tmp_path, content))
+
+    def test_too_many_rods(self, tmp_path: Path) -> None:
+        rods = "".join(f"  - {{name: r{i}, from: [{i}, 0, 0], to: [{i}, 0, 9], diameter: 1}}\n" for i in range(1001))
+        assert "lines: found 1001 rods, expected at least 3" in fault(written(tmp_path, f"name: many\nlines:\n{rods}"))
+
+    def test_missing_file(self, tmp_path: Path) -> None:
+        assert "cannot be read: No such file or directory" in fault(tmp_path / "none.yaml")
+
+    def test_folder(self, tmp_path: Path) -> None:
+        assert "cannot be read: Is a directory" in fault(tmp_path)
+
+    def test_aliases_of_aliases_end_soon(self, tmp_path: Path) -> None:
+        levels = [f"  - &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]" for i in range(1, 30)]
+        content = "name: laughs\nlines:\n  - &l0 [1]\n" + "\n".join(levels)
+        assert "lines[0]: found a list, expected the keys" in fault(written(tmp_path, content))

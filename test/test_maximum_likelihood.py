@@ -1,0 +1,243 @@
+"""The maximum likelihood pose: at rest at the truth, found from afar, and as uncertain as it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from frames import random_frame, random_slice_from_frame
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
+from stereoreg_ros.geometry.projection import cut
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
+
+SCALE = PixelScale(0.5, 0.5)
+OBLONG = PixelScale(0.4, 0.9, 0.05)
+
+
+def scene(seed: int, n: int) -> tuple[Frame, Pose, Array]:
+    """A random frame, its true slice_from_frame, and the exact cuts (n, 2) mm."""
+    rng = np.random.default_rng(seed)
+    frame = random_frame(rng, n)
+    pose = random_slice_from_frame(rng, frame)
+    return frame, pose, cut(frame, pose.rotation, pose.translation).points_mm
+
+
+def refined(frame: Frame, start: Pose, spots_mm: Array, whitening: Array, used: Array | None = None) -> Refined:
+    """`refine` for spots (m, n, 2), all from one start."""
+    m, n = spots_mm.shape[:2]
+    mask = np.ones((m, n), dtype=bool) if used is None else np.broadcast_to(used, (m, n)).astype(bool)
+    rotations, translations = np.tile(start.rotation, (m, 1, 1)), np.tile(start.translation, (m, 1))
+    return refine(frame, rotations, translations, spots_mm, mask, whitening)
+
+
+def pose_errors(found: Refined, true: Pose) -> Array:
+    """(m, 6) in the perturbation of `Pose.perturbed`."""
+    turns = Rotation.from_matrix(found.rotations @ true.rotation.T).as_rotvec()
+    return np.hstack([found.translations - true.translation, turns])
+
+
+def chi_square(frame: Frame, pose: Pose, spots_mm: Array, whitening: Array) -> float:
+    residual = (spots_mm - cut(frame, pose.rotation, pose.translation).points_mm) @ whitening.T
+    return float((residual**2).sum())
+
+
+def steps(pose: Pose, size: float) -> list[tuple[Pose, Pose]]:
+    """The pose a step ahead and a step behind in each of its six directions, mm and 1/50 rad."""
+    moves = size * np.diag([1, 1, 1, 0.02, 0.02, 0.02])
+    return [(pose.perturbed(d[:3], d[3:]), pose.perturbed(-d[:3], -d[3:])) for d in moves]
+
+
+class TestMinimum:
+    @pytest.mark.parametrize("n", [3, 4, 6])
+    def test_stays_at_the_truth(self, n: int) -> None:
+        frame, true, spots = scene(n, n)
+        found = refined(frame, true, spots[None], SCALE.inverse_matrix / 0.1)
+        assert found.chi_square[0] == pytest.approx(0, abs=1e-20)
+        assert found.converged[0]
+        np.testing.assert_allclose(pose_errors(found, true), 0, atol=1e-9)
+
+    @pytest.mark.parametrize("n", [4, 5, 6, 8])
+    def test_converges_from_5_mm_and_5_degrees(self, n: int) -> None:
+        rng = np.random.default_rng(100 + n)
+        for seed in range(12):
+            frame, true, spots = scene(1000 * n + seed, n)
+            aside = rng.normal(size=(2, 3))
+            aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+            start = true.perturbed(5.0 * aside[0], np.radians(5.0) * aside[1])
+            found = refined(frame, start, spots[None], SCALE.inverse_matrix / 0.1)
+            assert found.converged[0]
+            assert np.linalg.norm(found.translations[0] - true.translation) < 1e-9
+            assert rotation_angle(found.rotations[0] @ true.rotation.T) < 1e-10
+            assert found.chi_square[0] < 1e-16
+
+    @pytest.mark.parametrize("scale", [SCALE, OBLONG], ids=str)
+    @pytest.mark.parametrize("n", [4, 6])
+    def test_is_the_minimum_that_scipy_finds(self, n: int, scale: PixelScale) -> None:
+        rng = np.random.default_rng(7)
+        whitening = scale.inverse_matrix / 0.3
+        for seed in range(3):
+            frame, true, exact = scene(seed, n)
+            spots = exact + scale.to_mm(rng.normal(0, 0.3, (n, 2)))
+
+            def residual(
+                move: Array, frame: Frame = frame, true: Pose = true, spots: Array = spots, whitening: Array = whitening
+            ) -> Array:
+                pose = true.perturbed(move[:3], move[3:])
+                rest: Array = (spots - cut(frame, pose.rotation, pose.translation).points_mm) @ whitening.T
+                return rest.ravel()
+
+            found = refined(frame, true, spots[None], whitening)
+            other = least_squares(residual, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale="jac")
+            expected = true.perturbed(other.x[:3], other.x[3:])
+            assert found.converged[0]
+            assert found.chi_square[0] == pytest.approx(2 * other.cost, rel=1e-7)
+            np.testing.assert_allclose(found.translations[0], expected.translation, atol=2e-4)
+            np.testing.assert_allclose(found.rotations[0], expected.rotation, atol=1e-5)
+
+    def test_gradient_vanishes_at_the_minimum(self) -> None:
+        frame, true, exact = scene(5, 6)
+        spots = exact + np.random.default_rng(1).normal(0, 0.1, exact.shape)
+        whitening = SCALE.inverse_matrix / 0.2
+        found = refined(frame, true, spots[None], whitening)
+        pose = Pose(found.rotations[0], found.translations[0])
+        assert chi_square(frame, pose, spots, whitening) == pytest.approx(float(found.chi_square[0]), rel=1e-12)
+
+        def gradient(at: Pose) -> Array:
+            return np.array(
+                [
+                    chi_square(frame, ahead, spots, whitening) - chi_square(frame, behind, spots, whitening)
+                    for ahead, behind in steps(at, 1e-3)
+                ]
+            ) / (2e-3)
+
+        assert np.abs(gradient(true)).max() > 1
+        assert np.abs(gradient(pose)).max() < 1e-2
+
+    def test_information_is_the_square_of_the_jacobian(self) -> None:
+        frame, true, spots = scene(6, 5)
+        whitening = OBLONG.inverse_matrix / 0.2
+        found = refined(frame, true, spots[None], whitening)
+        columns = []
+        for k, (ahead, behind) in enumerate(steps(true, 1e-4)):
+            difference = cut(frame, ahead.rotation, ahead.translation).points_mm
+            difference = difference - cut(frame, behind.rotation, behind.translation).points_mm
+            columns.append((difference @ whitening.T).ravel() / (2e-4 * (1 if k < 3 else 0.02)))
+        jacobian = np.stack(columns, axis=1)
+        np.testing.assert_allclose(found.information[0], jacobian.T @ jacobian, rtol=1e-5, atol=1e-3)
+
+    def test_only_the_used_spots_count(self) -> None:
+        frame, true, spots = scene(8, 7)
+        used = np.array([1, 1, 0, 1, 0, 1, 1])
+        wild = np.where(used[:, None] == 1, spots, np.nan)
+        start = true.perturbed(np.array([1.0, -1.0, 2.0]), np.array([0.02, 0.0, -0.03]))
+        found = refined(frame, start, wild[None], SCALE.inverse_matrix / 0.1, used)
+        np.testing.assert_allclose(pose_errors(found, true), 0, atol=1e-9)
+        assert found.cuts.points_mm.shape == (1, 7, 2)
+        np.testing.assert_allclose(found.cuts.points_mm[0], spots, atol=1e-8)
+
+    def test_many_at_once_are_one_by_one(self) -> None:
+        frame, true, exact = scene(9, 5)
+        rng = np.random.default_rng(2)
+        spots = exact + rng.normal(0, 0.2, (8, 5, 2))
+        used = np.ones((8, 5), dtype=bool)
+        used[::2, 1] = False
+        starts = [true.perturbed(rng.normal(0, 1, 3), rng.normal(0, 0.03, 3)) for _ in range(8)]
+        rotations, translations = np.stack([s.rotation for s in starts]), np.stack([s.translation for s in starts])
+        kept = rotations.copy(), translations.copy()
+        together = refine(frame, rotations, translations, spots, used, SCALE.inverse_matrix / 0.3)
+        for i in range(8):
+            row = slice(i, i + 1)
+            alone = refine(frame, rotations[row], translations[row], spots[row], used[row], SCALE.inverse_matrix / 0.3)
+            np.testing.assert_allclose(together.translations[i], alone.translations[0], atol=1e-9)
+            np.testing.assert_allclose(together.take(np.array([i])).chi_square, alone.chi_square, rtol=1e-9)
+        np.testing.assert_array_equal(rotations, kept[0])
+        np.testing.assert_array_equal(translations, kept[1])
+
+    def test_nothing_to_refine(self) -> None:
+        frame, _, _ = scene(9, 5)
+        found = refine(
+            frame, np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 5, 2)), np.empty((0, 5), dtype=bool), np.eye(2)
+        )
+        assert found.rotations.shape == (0, 3, 3)
+        assert found.information.shape == (0, 6, 6)
+
+
+class TestStatistics:
+    """Limits at 99.9 %, two sides, for the seed as it is."""
+
+    COUNT = 2000
+
+    @pytest.mark.parametrize(("scale", "n", "noise_px"), [(SCALE, 6, 0.3), (OBLONG, 6, 0.1), (SCALE, 4, 0.05)])
+    def test_errors_are_as_large_as_the_information_says(self, scale: PixelScale, n: int, noise_px: float) -> None:
+        frame, true, exact = scene(21, n)
+        rng = np.random.default_rng(3)
+        whitening = scale.inverse_matrix / noise_px
+        found = refined(frame, true, exact + scale.to_mm(rng.normal(0, noise_px, (self.COUNT, n, 2))), whitening)
+        assert found.converged.all()
+        errors = pose_errors(found, true)
+        squared = np.einsum("mi,mij,mj->m", errors, found.information, errors)
+        assert squared.mean() == pytest.approx(6, abs=3.29 * np.sqrt(12 / self.COUNT))
+        freedom = 2 * n - 6
+        assert found.chi_square.mean() == pytest.approx(freedom, abs=3.29 * np.sqrt(2 * freedom / self.COUNT))
+        # The sample covariance in the axes in which the stated one is the unit matrix: its entries' errors are known.
+        at_truth = refined(frame, true, exact[None], whitening).information[0]
+        unit = errors @ np.linalg.cholesky(at_truth)
+        sample = unit.T @ unit / self.COUNT
+        np.testing.assert_allclose(np.diag(sample), 1, atol=4.5 * np.sqrt(2 / self.COUNT))
+        np.testing.assert_allclose(sample - np.diag(np.diag(sample)), 0, atol=4.5 / np.sqrt(self.COUNT))
+
+    def test_whitening_weighs_the_axes(self) -> None:
+        # Noise in x alone is ten times that in y: told so, the pose is much surer than with equal weights.
+        frame, true, exact = scene(22, 6)
+        noise = np.random.default_rng(4).normal(0, 1, (self.COUNT, 6, 2)) * [0.5, 0.05]
+        told = refined(frame, true, exact + noise, np.diag([1 / 0.5, 1 / 0.05]))
+        untold = refined(frame, true, exact + noise, np.eye(2) / 0.5)
+        errors = pose_errors(told, true)
+        squared = np.einsum("mi,mij,mj->m", errors, told.information, errors)
+        assert squared.mean() == pytest.approx(6, abs=3.29 * np.sqrt(12 / self.COUNT))
+        assert np.linalg.norm(errors, axis=1).mean() < 0.8 * np.linalg.norm(pose_errors(untold, true), axis=1).mean()
+
+
+class TestSingular:
+    def test_three_parallel_rods(self) -> None:
+        n = 5
+        starts = np.array([[0, 0, -30], [40, 0, -30], [0, 30, -30], [-30, -30, -30], [20, 20, -30]], dtype=float)
+        ends = starts + np.array([0.0, 0.0, 60.0])
+        ends[3:, 0] += 15.0
+        frame = Frame("parallel", tuple("abcde"), starts, ends, np.ones(n))
+        true = Pose(rotation_exp(np.array([0.1, -0.15, 0.4])), np.array([100.0, 90.0, 2.0]))
+        spots = cut(frame, true.rotation, true.translation).points_mm
+        start = true.perturbed(np.array([0.5, 0.5, 1.0]), np.array([0.01, -0.02, 0.01]))
+        found = refined(frame, start, spots[None], SCALE.inverse_matrix / 0.1, np.array([1, 1, 1, 0, 0]))
+        assert np.isfinite(found.translations).all()
+        assert np.linalg.det(found.rotations[0]) == pytest.approx(1)
+        assert found.chi_square[0] < 1e-6
+        # The position along the rods is what three parallel ones do not tell.
+        values, vectors = np.linalg.eigh(found.information[0])
+        assert values[0] < 1e-9 * values[-1]
+        np.testing.assert_allclose(np.abs(vectors[:3, 0]), np.abs(found.rotations[0][:, 2]), atol=1e-4)
+
+    def test_no_spot_and_one_spot(self) -> None:
+        frame, true, spots = scene(30, 4)
+        used = np.array([[0, 0, 0, 0], [0, 1, 0, 0]])
+        found = refined(frame, true, np.stack([spots, spots + 1.0]), SCALE.inverse_matrix / 0.1, used)
+        assert found.chi_square[0] == 0
+        np.testing.assert_array_equal(found.translations[0], true.translation)
+        assert found.chi_square[1] < 1e-6
+        assert np.isfinite(found.rotations).all()
+
+    def test_a_rod_within_the_slice_is_left_where_it_is(self) -> None:
+        starts = np.array([[0, 0, -30], [40, 0, -30], [0, 30, -30], [-30, 10, 0]], dtype=float)
+        ends = np.array([[5, 0, 30], [40, 9, 30], [-7, 30, 30], [30, 10, 0]], dtype=float)
+        frame = Frame("flat", tuple("abcd"), starts, ends, np.ones(4))
+        spots = np.zeros((1, 4, 2))
+        found = refined(frame, Pose.identity(), spots, np.eye(2))
+        assert not found.converged[0]
+        assert np.isnan(found.chi_square[0])
+        np.testing.assert_array_equal(found.translations[0], 0)
+        without = refined(frame, Pose.identity(), spots, np.eye(2), np.array([1, 1, 1, 0]))
+        assert np.isfinite(without.chi_square[0])

@@ -1,0 +1,105 @@
+"""The table of parameters: complete, described, bounded, checked as a whole, and equal to the shipped file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import yaml
+
+from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
+from stereoreg_ros.options import RegistrationOptions
+
+CONFIG = Path(__file__).resolve().parent.parent / "config" / "register_node.yaml"
+DEFAULTS = {entry.name: entry.default for entry in ENTRIES}
+
+CONTRACT = {
+    "frame_file",
+    "pixel_spacing",
+    "pixel_shear",
+    "rescale_slope",
+    "rescale_intercept",
+    "threshold",
+    "spot_noise_px",
+    "min_inliers",
+    "matcher",
+    "max_log10_false_alarms",
+    "nominal_orientation",
+    "max_rotation_deg",
+    "scanner_frame_id",
+    "fiducial_frame_id",
+    "max_position_std_mm",
+}
+
+
+def test_table_holds_the_contract_and_every_option():
+    assert set(DEFAULTS) >= CONTRACT
+    assert set(DEFAULTS) >= {field.name for field in fields(RegistrationOptions)}
+    assert len(DEFAULTS) == len(ENTRIES)
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
+def test_descriptor(entry):
+    descriptor = entry.descriptor
+    assert descriptor.description == entry.description != ""
+    if isinstance(entry.default, float):
+        (bounds,) = descriptor.floating_point_range
+        assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0.0)
+    elif isinstance(entry.default, int):
+        (bounds,) = descriptor.integer_range
+        assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0)
+    elif isinstance(entry.default, tuple):
+        assert descriptor.additional_constraints == f"{len(entry.default)} numbers"
+
+
+def test_shipped_file_equals_the_defaults_and_explains_them():
+    text = CONFIG.read_text(encoding="utf-8")
+    values = yaml.safe_load(text)["/**/register_node"]["ros__parameters"]
+    assert values == {entry.name: entry.value for entry in ENTRIES}
+    assert list(values) == list(DEFAULTS)
+    assert {name: type(value) for name, value in values.items()} == {e.name: type(e.value) for e in ENTRIES}
+    lines = [line.strip() for line in text.splitlines()]
+    for entry in ENTRIES:
+        (number,) = (n for n, line in enumerate(lines) if line.startswith(f"{entry.name}:"))
+        bounds = f"; from {entry.low:g} to {entry.high:g}" if entry.low is not None else ""
+        assert lines[number - 1] == f"# {entry.description}{bounds}"
+
+
+def test_defaults_are_valid_and_know_no_spacing():
+    settings = NodeSettings.from_parameters(DEFAULTS)
+    assert settings.options == RegistrationOptions()
+    assert settings.scale is None
+
+
+def test_values_reach_their_places():
+    changed = {**DEFAULTS, "pixel_spacing": (0.5, 0.7), "pixel_shear": 0.01, "threshold": 1500.0}
+    settings = NodeSettings.from_parameters(changed)
+    assert settings.options.threshold == 1500.0
+    assert settings.scale is not None
+    assert (settings.scale.sx, settings.scale.sy, settings.scale.shear) == (0.5, 0.7, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("pixel_spacing", (0.5,), "pixel_spacing has 1 numbers, expected two"),
+        ("pixel_spacing", (0.5, -0.5), "pixel_spacing is .*, expected two positive numbers of mm/pixel"),
+        ("pixel_spacing", (0.0, 0.5), "pixel_spacing is .*, expected two positive numbers"),
+        ("pixel_spacing", (math.nan, 0.5), "pixel_spacing is .*, expected two positive numbers"),
+        ("pixel_spacing", (math.inf, 0.5), "pixel_spacing is .*, expected two positive numbers"),
+        ("pixel_shear", math.nan, "pixel_shear is nan, expected a number from -10 to 10"),
+        ("rescale_slope", 0.0, "rescale_slope is 0.0, expected a number that is not 0"),
+        ("rescale_intercept", math.inf, "rescale_intercept is inf, expected a number from"),
+        ("frame_file", "", "frame_file is empty, expected a name"),
+        ("fiducial_frame_id", "", "fiducial_frame_id is empty, expected a name"),
+        ("matcher", "guess", "matcher is 'guess', expected one of"),
+        ("nominal_orientation", (0.0, 0.0, 1.0), "nominal_orientation: .*expected \\(4,\\)"),
+        ("nominal_orientation", (0.0, 0.0, 0.0, 0.0), "nominal_orientation: .*no length"),
+        ("min_spot_area_mm2", 90.0, "min_spot_area_mm2 is 90, expected less than max_spot_area_mm2"),
+    ],
+)
+def test_faulty_value_is_named(name, value, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        NodeSettings.from_parameters({**DEFAULTS, name: value})

@@ -1,0 +1,636 @@
+"""register_node as a process of its own, over DDS: poses, refusals, bad input, parameters, services."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from itertools import count
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+import yaml
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Point, PointStamped, PoseStamped, PoseWithCovarianceStamped, Quaternion
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterEvent, ParameterValue
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from ros_process import REPOSITORY, ROS_ENVIRONMENT, NodeProcess, RosClient, node_process
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from stereoreg_ros import PixelScale, Pose, load_frame
+from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
+from stereoreg_ros.nodes import conversions, register_node
+from stereoreg_ros.nodes.parameters import ENTRIES
+from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
+
+NODE = "/register_node"
+SCALE = PixelScale(0.5, 0.6)
+SCANNER = ScannerSettings(shape=(256, 256), scale=SCALE)
+CUBE = load_frame("cube6")
+KEYS = [
+    "outcome",
+    "reason",
+    "frame",
+    "spots",
+    "lines",
+    "inliers",
+    "residual_rms_mm",
+    "residual_rms_px",
+    "log10_false_alarms",
+    "ambiguous_poses",
+    "position_std_mm",
+    "rotation_std_deg",
+    "target_error_95_mm",
+    "pixel_spacing_x_mm",
+    "pixel_spacing_y_mm",
+    "calibration",
+    "duration_ms",
+]
+NUMBERS = set(KEYS) - {"outcome", "reason", "frame", "calibration"}
+START = {entry.name: entry.value for entry in ENTRIES} | {"pixel_spacing": [SCALE.sx, SCALE.sy]}
+
+
+def rendered(seed: int, hidden: tuple[str, ...] = (), **settings: Any) -> tuple[np.ndarray, Pose]:
+    """A slice of cube6 (rows, columns) in HU, and its slice_from_frame."""
+    rng = np.random.default_rng(seed)
+    pose = random_pose(rng, CUBE, SCANNER, max_offset_mm=15.0)
+    scanner = ScannerSettings(shape=SCANNER.shape, scale=SCALE, **settings)
+    return render_slice([PlacedFrame(CUBE, pose, hidden)], scanner, rng).hu, pose
+
+
+def image_of(hu: np.ndarray, dtype: str = "<i2", encoding: str = "16SC1", padding: int = 0) -> Image:
+    """An image message in any layout."""
+    stored = hu.astype(dtype)
+    rows, columns = stored.shape
+    row_bytes = columns * stored.itemsize
+    padded = np.full((rows, row_bytes + padding), 0x5A, np.uint8)
+    padded[:, :row_bytes] = np.ascontiguousarray(stored).view(np.uint8)
+    image = Image(height=rows, width=columns, encoding=encoding, step=row_bytes + padding, data=padded.tobytes())
+    image.is_bigendian = int(dtype.startswith(">"))
+    return image
+
+
+class Bench:
+    """A client beside a running register_node: sends slices and gathers what becomes of them."""
+
+    _stamps = count(1000)
+
+    def __init__(
+        self, client: RosClient, namespace: str = "", image_topic: str = "image", scanner_frame_id: str = "ct"
+    ) -> None:
+        self.client = client
+        self.namespace = namespace
+        self.node = f"{namespace}{NODE}"
+        self.image_topic = image_topic
+        self.scanner_frame_id = scanner_frame_id
+        self.diagnostics = client.collect(DiagnosticArray, "/diagnostics")
+        self.poses = client.collect(PoseStamped, f"{namespace}/pose")
+        self.with_covariance = client.collect(PoseWithCovarianceStamped, f"{namespace}/pose_with_covariance")
+        self.targets = client.collect(PointStamped, f"{namespace}/target_in_frame")
+
+    def next_stamp(self) -> Time:
+        return Time(sec=next(self._stamps), nanosec=1)
+
+    def send(self, image: Image, frame_id: str = "ct", stamp: Time | None = None) -> Time:
+        image.header.frame_id = frame_id
+        image.header.stamp = stamp or self.next_stamp()
+        self.client.publish(self.image_topic, image)
+        return image.header.stamp
+
+    def status(self, stamp: Time) -> DiagnosticStatus:
+        """The one status of the image with this stamp."""
+        array = self.client.wait_for(lambda: of_stamp(self.diagnostics, stamp), "the diagnostics of an image")
+        (status,) = array.status
+        assert status.name == "register_node: registration"
+        assert [pair.key for pair in status.values] == KEYS
+        for pair in status.values:
+            if pair.key in NUMBERS:
+                float(pair.value)
+        return status
+
+    def pose(self, stamp: Time) -> Pose:
+        """The pose published with this stamp."""
+        message = self.client.wait_for(lambda: of_stamp(self.poses, stamp), "a pose")
+        return conversions.pose_from_message(message)
+
+    def accept(self, image: Image, **kwargs: Any) -> tuple[Pose, dict[str, str]]:
+        """Send an image that must be accepted; returns its pose and its diagnostic values."""
+        stamp = self.send(image, **kwargs)
+        status = self.status(stamp)
+        assert status.level != DiagnosticStatus.ERROR, status.message
+        return self.pose(stamp), values_of(status)
+
+    def refuse(self, image: Image, reason: str, sentence: str, **kwargs: Any) -> None:
+        """Send an image that must be refused, and then a good one, before which no pose may come."""
+        stamp = self.send(image, **kwargs)
+        status = self.status(stamp)
+        assert status.level == DiagnosticStatus.ERROR
+        assert sentence in status.message
+        values = values_of(status)
+        assert (values["outcome"], values["reason"]) == ("refused", reason)
+        assert of_stamp(self.poses, stamp) is None
+
+    def call(self, service: str) -> Trigger.Response:
+        return self.client.call(Trigger, f"{self.node}/{service}")
+
+    def set(self, **values: Any) -> str:
+        """Set parameters as one; returns why they were refused, or nothing."""
+        result = self.client.set_parameters(self.node, **values)
+        assert result.successful != bool(result.reason)
+        return str(result.reason)
+
+    def warm_up(self, *received: list[Any]) -> None:
+        """Until both sides have discovered each other, messages go astray: repeat until every topic has delivered."""
+        hu, _ = rendered(1)
+        received = received or (self.diagnostics, self.poses, self.with_covariance, self.targets)
+        next_try = 0.0
+
+        def all_delivered() -> bool:
+            nonlocal next_try
+            if time.monotonic() > next_try:
+                next_try = time.monotonic() + 0.2
+                self.client.publish(f"{self.namespace}/target", target_of([0, 0, 0], self.scanner_frame_id))
+                self.send(image_of(hu))
+            return all(received)
+
+        self.client.wait_for(all_delivered, "the first messages of all topics")
+
+
+def of_stamp(messages: list[Any], stamp: Time) -> Any:
+    return next((message for message in messages if message.header.stamp == stamp), None)
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def target_of(point_mm: Any, frame_id: str = "ct") -> PointStamped:
+    message = PointStamped(point=conversions.point_to_message(np.asarray(point_mm, float)))
+    message.header.frame_id = frame_id
+    return message
+
+
+def assert_near(found: Pose, true: Pose) -> None:
+    assert np.linalg.norm(found.translation - true.translation) < 0.5
+    assert math.degrees(float(rotation_angle(found.rotation @ true.rotation.T))) < 1.0
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[RosClient]:
+    with RosClient() as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def running(client) -> Iterator[Bench]:
+    spacing = f"pixel_spacing:=[{SCALE.sx},{SCALE.sy}]"
+    with node_process("register_node", "--ros-args", "-p", spacing):
+        bench = Bench(client)
+        bench.warm_up()
+        yield bench
+
+
+@pytest.fixture
+def bench(running) -> Iterator[Bench]:
+    """The running node, with its parameters as at its start."""
+    yield running
+    assert running.set(**START) == ""
+
+
+def test_pose_covariance_and_diagnostics(bench):
+    hu, slice_from_frame = rendered(2)
+    stamp = bench.send(image_of(hu))
+    assert_near(bench.pose(stamp), slice_from_frame)
+    pose = of_stamp(bench.poses, stamp)
+    assert pose.header.frame_id == "ct"
+
+    with_covariance = bench.client.wait_for(lambda: of_stamp(bench.with_covariance, stamp), "pose_with_covariance")
+    assert with_covariance.header == pose.header
+    assert with_covariance.pose.pose == pose.pose
+    covariance = np.reshape(with_covariance.pose.covariance, (6, 6))
+    assert np.allclose(covariance, covariance.T, rtol=1e-9)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+    status = bench.status(stamp)
+    assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, "ct")
+    assert status.message.startswith("registered 6 of 6 rods, residual 0.")
+    values = values_of(status)
+    assert (values["outcome"], values["reason"], values["frame"]) == ("accepted", "", "cube6")
+    assert (values["spots"], values["lines"], values["inliers"], values["ambiguous_poses"]) == ("6", "6", "6", "1")
+    assert (values["pixel_spacing_x_mm"], values["pixel_spacing_y_mm"]) == ("0.5", "0.6")
+    assert values["calibration"] == "configured"
+    assert 0 < float(values["residual_rms_mm"]) < 0.3
+    assert float(values["duration_ms"]) > 0
+    worst_mm = 1e3 * math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    assert float(values["position_std_mm"]) == pytest.approx(worst_mm, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("layout", "rescale"),
+    [
+        ({"dtype": ">i2", "padding": 7}, (1.0, 0.0)),
+        ({"dtype": "<u2", "encoding": "16UC1", "padding": 64}, (1.0, -1024.0)),
+        ({"dtype": ">u2", "encoding": "mono16"}, (0.5, -1024.0)),
+        ({"dtype": "<f4", "encoding": "32FC1", "padding": 4}, (1.0, 0.0)),
+        ({"dtype": ">f4", "encoding": "32FC1", "padding": 1}, (2.0, 100.0)),
+    ],
+    ids=str,
+)
+def test_every_layout_gives_the_same_pose(bench, layout, rescale):
+    hu, _ = rendered(3)
+    expected, _ = bench.accept(image_of(hu))
+    slope, intercept = rescale
+    assert bench.set(rescale_slope=slope, rescale_intercept=intercept) == ""
+    found, _ = bench.accept(image_of((hu - intercept) / slope, **layout))
+    assert np.allclose(found.translation, expected.translation, atol=1e-6)
+    assert np.allclose(found.rotation, expected.rotation, atol=1e-9)
+
+
+def test_frame_ids(bench):
+    assert bench.set(scanner_frame_id="scanner", fiducial_frame_id="fiducials") == ""
+    bench.targets.clear()
+    bench.client.publish("/target", target_of([0, 0, 0], "scanner"))
+    hu, _ = rendered(4)
+    stamp = bench.send(image_of(hu), frame_id="something else")
+    bench.pose(stamp)
+    assert of_stamp(bench.poses, stamp).header.frame_id == "scanner"
+    assert bench.status(stamp).hardware_id == "scanner"
+    target = bench.client.wait_for(lambda: of_stamp(bench.targets, stamp), "target_in_frame")
+    assert target.header.frame_id == "fiducials"
+
+
+def test_slice_without_rods_is_refused(bench):
+    bench.refuse(image_of(np.zeros((64, 64))), "too_few_spots", "0 spots")
+    hu, slice_from_frame = rendered(5)
+    assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+
+
+def with_changes(image: Image, **changes: Any) -> Image:
+    for name, value in changes.items():
+        setattr(image, name, value)
+    return image
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"encoding": "rgb8"}, "image encoding is 'rgb8', expected one of 16SC1"),
+        ({"step": 511}, "image step is 511, expected at least 512 bytes"),
+        ({"step": 514}, "image data has 131072 bytes, expected step * height = 514 * 256"),
+        ({"data": b""}, "image data has 0 bytes, expected"),
+        ({"height": 255}, "image data has 131072 bytes, expected"),
+        ({"width": 0, "height": 0, "step": 0, "data": b""}, "image width is 0, expected"),
+        ({"width": 2**32 - 1, "step": 2**32 - 1}, "image width is 4294967295, expected"),
+    ],
+    ids=str,
+)
+def test_faulty_image_is_refused_by_name(bench, changes, sentence):
+    hu, slice_from_frame = rendered(6)
+    bench.refuse(with_changes(image_of(hu), **changes), "bad_image", sentence)
+    assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_image_that_is_not_finite_is_refused(bench, value):
+    hu, slice_from_frame = rendered(6)
+    broken = hu.copy()
+    broken[3, 5] = value
+    bench.refuse(image_of(broken, "<f4", "32FC1"), "bad_image", "1 pixels that are not finite")
+    assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"pixel_spacing": [-0.5, 0.5]}, "pixel_spacing is [-0.5, 0.5], expected two positive numbers"),
+        ({"pixel_spacing": [0.0, 0.0]}, "pixel_spacing is [0, 0], expected two positive numbers"),
+        ({"pixel_spacing": [0.5, 0.5, 0.5]}, "pixel_spacing has 3 numbers, expected two"),
+        ({"pixel_spacing": 0.5}, "Wrong parameter type"),
+        ({"threshold": 1e9}, "threshold out of range"),
+        ({"threshold": math.nan}, "threshold out of range"),
+        ({"rescale_slope": 0.0}, "rescale_slope is 0.0, expected a number that is not 0"),
+        ({"matcher": "guess"}, "matcher is 'guess', expected one of"),
+        ({"nominal_orientation": [0.0, 0.0, 0.0, 0.0]}, "nominal_orientation"),
+        ({"min_spot_area_mm2": 90.0}, "min_spot_area_mm2 is 90, expected less than max_spot_area_mm2"),
+        ({"frame_file": "no_such_frame"}, "frame 'no_such_frame' is neither a file nor a shipped frame"),
+    ],
+    ids=str,
+)
+def test_faulty_parameter_is_refused_with_all_set_beside_it(bench, values, sentence):
+    assert sentence in bench.set(spot_noise_px=0.5, **values)
+    names = ["spot_noise_px", *values]
+    assert [
+        list(v) if isinstance(START[n], list) else v
+        for n, v in zip(names, bench.client.get_parameters(bench.node, *names), strict=True)
+    ] == [START[name] for name in names]
+    hu, slice_from_frame = rendered(7)
+    assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+
+
+def test_parameters_that_are_valid_only_together(bench):
+    assert bench.set(min_spot_area_mm2=90.0, max_spot_area_mm2=100.0) == ""
+
+
+def test_parameters_are_described(bench):
+    names = [entry.name for entry in ENTRIES]
+    descriptors = bench.client.describe_parameters(bench.node, *names)
+    assert [(d.name, d.description) for d in descriptors] == [(e.name, e.description) for e in ENTRIES]
+
+
+def test_malformed_frame_file_is_refused_and_the_old_frame_stays(bench, tmp_path):
+    path = tmp_path / "broken.yaml"
+    path.write_text("name: broken\nlines:\n  - {name: a, from: [0, 0, 0], to: [0, 0, x], diameter: 1}\n")
+    reason = bench.set(frame_file=str(path))
+    assert str(path) in reason
+    path.write_text("name: short\nlines: []\n")
+    assert "0 rods" in bench.set(frame_file=str(path))
+    hu, slice_from_frame = rendered(8)
+    pose, values = bench.accept(image_of(hu))
+    assert_near(pose, slice_from_frame)
+    assert values["frame"] == "cube6"
+
+
+def test_frame_can_be_changed(bench):
+    assert bench.set(frame_file="leksell_ct") == ""
+    hu, slice_from_frame = rendered(8)
+    stamp = bench.send(image_of(hu))
+    assert values_of(bench.status(stamp))["frame"] == load_frame("leksell_ct").name
+    assert bench.set(frame_file="cube6") == ""
+    assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+
+
+def test_pictures_while_subscribed(bench):
+    hu, slice_from_frame = rendered(9, hidden=(CUBE.line_names[0],))
+    with RosClient("viewer") as viewer:
+        overlays, markers = viewer.collect(Image, "/overlay"), viewer.collect(MarkerArray, "/markers")
+
+        def both_delivered() -> bool:
+            if not (overlays and markers):
+                bench.accept(image_of(hu))
+            return bool(overlays and markers)
+
+        viewer.wait_for(both_delivered, "overlay and markers")
+    overlay = overlays[-1]
+    assert overlay.encoding == "bgr8"
+    assert overlay.header.frame_id == "ct"
+    assert of_stamp(bench.poses, overlay.header.stamp) is not None
+    assert overlay.step * overlay.height == len(overlay.data)
+    rods = [marker for marker in markers[-1].markers if marker.type == Marker.CYLINDER]
+    assert markers[-1].markers[0].action == Marker.DELETEALL
+    assert {marker.ns for marker in rods} == {"stereotactic_frame"}
+    assert len({marker.id for marker in rods}) == len(CUBE)
+    colours = [(marker.color.r, marker.color.g) for marker in rods]
+    assert colours.count(colours[1]) == len(CUBE) - 1
+    assert colours[0] != colours[1]
+    middles = slice_from_frame @ (0.5 * (CUBE.starts + CUBE.ends))
+    shown = [[m.pose.position.x, m.pose.position.y, m.pose.position.z] for m in rods]
+    assert np.allclose(shown, middles / 1e3, atol=1.5e-3)
+    # Nobody looks any more, and slices are registered as before.
+    bench.accept(image_of(hu))
+
+
+def test_target_in_frame(bench):
+    hu, _ = rendered(10)
+    target = np.array([30.0, -20.0, 12.0])
+    bench.accept(image_of(hu))
+    bench.targets.clear()
+    bench.client.publish("/target", target_of(target))
+    # Answered at once from the latest pose, and again with every pose.
+    bench.client.wait_for(lambda: bench.targets, "target_in_frame")
+    stamp = bench.send(image_of(hu))
+    answer = bench.client.wait_for(lambda: of_stamp(bench.targets, stamp), "target_in_frame")
+    assert answer.header.frame_id == "stereotactic_frame"
+    found = bench.pose(stamp) @ conversions.point_from_message(answer)
+    assert np.allclose(found, target, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", [target_of([1, 2, 3], "elsewhere"), target_of([math.nan, 0, 0])], ids=["id", "nan"])
+def test_faulty_target_is_ignored(bench, target):
+    bench.client.publish("/target", target)
+    for _ in range(2):
+        bench.accept(image_of(rendered(11)[0]))
+    bench.targets.clear()
+    stamps = [bench.send(image_of(rendered(11)[0])) for _ in range(2)]
+    for stamp in stamps:
+        bench.pose(stamp)
+    bench.client.publish("/target", target_of([1, 2, 3]))
+    answer = bench.client.wait_for(lambda: bench.targets, "target_in_frame")[0]
+    assert answer.header.stamp == stamps[-1]
+    assert len(bench.targets) == 1
+
+
+def test_recalibrate_and_reset(bench):
+    wrong = [1.01 * SCALE.sx, 0.99 * SCALE.sy]
+    assert bench.set(pixel_spacing=wrong) == ""
+    response = bench.call("recalibrate")
+    assert not response.success
+    assert "no slice has been accepted yet" in response.message
+
+    events = bench.client.collect(ParameterEvent, "/parameter_events")
+    hu, slice_from_frame = rendered(12, noise_hu=5.0)
+    bench.accept(image_of(hu))
+    response = bench.call("recalibrate")
+    assert response.success, response.message
+    (measured,) = bench.client.get_parameters(bench.node, "pixel_spacing")
+    assert np.allclose(measured, [SCALE.sx, SCALE.sy], rtol=3e-3)
+    changed = bench.client.wait_for(
+        lambda: [e for e in events if e.node == NODE and e.changed_parameters], "a parameter event"
+    )[-1]
+    assert [parameter.name for parameter in changed.changed_parameters] == ["pixel_spacing", "pixel_shear"]
+    pose, values = bench.accept(image_of(hu))
+    assert_near(pose, slice_from_frame)
+    assert values["calibration"] == "measured"
+    assert float(values["pixel_spacing_x_mm"]) == pytest.approx(measured[0], rel=1e-6)
+
+    response = bench.call("reset_calibration")
+    assert response.success, response.message
+    (spacing,) = bench.client.get_parameters(bench.node, "pixel_spacing")
+    assert list(spacing) == wrong
+    assert bench.accept(image_of(hu))[1]["calibration"] == "configured"
+
+
+def test_recalibrate_refused_changes_nothing(bench):
+    # Four rods fix a pose that somebody may want to have, but no scale.
+    assert bench.set(max_log10_false_alarms=0.0, max_position_std_mm=1000.0, max_rotation_deg=30.0) == ""
+    hu, _ = rendered(13, hidden=CUBE.line_names[:2])
+    status = bench.status(bench.send(image_of(hu)))
+    assert values_of(status)["inliers"] == "4", status.message
+    assert status.level != DiagnosticStatus.ERROR, status.message
+    response = bench.call("recalibrate")
+    assert not response.success
+    assert response.message
+    (spacing,) = bench.client.get_parameters(bench.node, "pixel_spacing")
+    assert list(spacing) == [SCALE.sx, SCALE.sy]
+    assert bench.accept(image_of(rendered(14)[0]))[1]["calibration"] == "configured"
+
+
+def test_spacing_from_outside_becomes_the_configured_one(bench):
+    hu, _ = rendered(12, noise_hu=5.0)
+    bench.accept(image_of(hu))
+    assert bench.call("recalibrate").success
+    assert bench.set(pixel_spacing=[0.501, 0.601]) == ""
+    assert bench.accept(image_of(hu))[1]["calibration"] == "configured"
+    assert bench.call("reset_calibration").success
+    (spacing,) = bench.client.get_parameters(bench.node, "pixel_spacing")
+    assert list(spacing) == [0.501, 0.601]
+
+
+def test_without_frame_and_spacing_the_node_waits_for_them(client, tmp_path):
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("name: [\n")
+    hu, slice_from_frame = rendered(15)
+    with node_process("register_node", "--ros-args", "-r", "__ns:=/bare", "-p", f"frame_file:={broken}") as process:
+        bench = Bench(client, "/bare", "/bare/image")
+        bench.warm_up(bench.diagnostics)
+        bench.refuse(image_of(hu), "bad_frame", str(broken))
+        assert str(broken) in process.output
+        assert bench.set(frame_file="cube6") == ""
+        bench.refuse(image_of(hu), "bad_image", "pixel_spacing is not told yet, set the parameter")
+        assert not bench.call("recalibrate").success
+        assert not bench.call("reset_calibration").success
+        assert bench.set(pixel_spacing=[SCALE.sx, SCALE.sy]) == ""
+        assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+
+
+@pytest.mark.parametrize("with_signal", [signal.SIGTERM, signal.SIGINT])
+def test_parameter_file_namespace_remapping_and_clean_end(client, tmp_path, with_signal):
+    content = yaml.safe_load((REPOSITORY / "config" / "register_node.yaml").read_text())
+    told = content["/**/register_node"]["ros__parameters"]
+    told["pixel_spacing"] = [SCALE.sx, SCALE.sy]
+    told["scanner_frame_id"] = "from_the_file"
+    path = tmp_path / "register_node.yaml"
+    path.write_text(yaml.safe_dump(content))
+    namespace = f"/robot_{with_signal.name.lower()}"
+    arguments = ["-r", f"__ns:={namespace}", "-r", "image:=/ct/slices", "--params-file", str(path)]
+    with node_process("register_node", "--ros-args", *arguments) as process:
+        bench = Bench(client, namespace, "/ct/slices", "from_the_file")
+        bench.warm_up()
+        hu, slice_from_frame = rendered(16)
+        stamp = bench.send(image_of(hu))
+        assert_near(bench.pose(stamp), slice_from_frame)
+        assert of_stamp(bench.poses, stamp).header.frame_id == "from_the_file"
+        code, seconds = process.stop(with_signal)
+        assert code == 0
+        assert seconds < 1.0
+        assert "Traceback" not in process.output
+
+
+def slice_pose_of(pose: Pose, stamp: Time) -> PoseStamped:
+    message = PoseStamped(pose=conversions.pose_to_message(pose))
+    message.header.stamp, message.header.frame_id = stamp, "ct"
+    return message
+
+
+def test_slice_pose(client):
+    hu, slice_from_frame = rendered(17)
+    scanner_from_slice = Pose(rotation_exp(np.array([0.3, -0.2, 0.5])), np.array([100.0, -50.0, 25.0]))
+    expected = scanner_from_slice @ slice_from_frame
+    arguments = ["-r", "__ns:=/posed", "-p", f"pixel_spacing:=[{SCALE.sx},{SCALE.sy}]"]
+    with node_process("register_node", "--ros-args", *arguments):
+        bench = Bench(client, "/posed", "/posed/image")
+        bench.warm_up()
+        topic = "/posed/slice_pose"
+
+        stamp = bench.next_stamp()
+        client.publish(topic, slice_pose_of(scanner_from_slice, stamp))
+        assert_near(bench.accept(image_of(hu), stamp=stamp)[0], expected)
+
+        # The image first: it waits for its pose.
+        stamp = bench.send(image_of(hu))
+        client.publish(topic, slice_pose_of(scanner_from_slice, stamp))
+        assert_near(bench.pose(stamp), expected)
+
+        late = bench.next_stamp()
+        client.publish(topic, slice_pose_of(scanner_from_slice, late))
+        bench.refuse(image_of(hu), "bad_image", "no slice_pose with the image's stamp came within 0.5 s")
+
+        stamp = bench.next_stamp()
+        broken = slice_pose_of(scanner_from_slice, stamp)
+        broken.pose.orientation = Quaternion(x=0.0, y=0.0, z=0.0, w=0.5)
+        client.publish(topic, broken)
+        bench.refuse(image_of(hu), "bad_image", "slice_pose: pose.orientation", stamp=stamp)
+
+        stamp = bench.next_stamp()
+        broken = slice_pose_of(scanner_from_slice, stamp)
+        broken.pose.position = Point(x=math.nan)
+        client.publish(topic, broken)
+        bench.refuse(image_of(hu), "bad_image", "slice_pose: pose.position", stamp=stamp)
+
+        stamp = bench.next_stamp()
+        client.publish(topic, slice_pose_of(scanner_from_slice, stamp))
+        client.publish(topic, slice_pose_of(Pose.identity(), stamp))
+        # Topics overtake each other; when another slice has met its pose, both of these poses have come.
+        last = bench.send(image_of(hu))
+        client.publish(topic, slice_pose_of(scanner_from_slice, last))
+        assert_near(bench.pose(last), expected)
+        bench.refuse(image_of(hu), "bad_image", "two different slice_pose", stamp=stamp)
+
+        assert_near(bench.accept(image_of(hu), stamp=late)[0], expected)
+
+        # Without publisher the pose is still missed: the scanner's axes do not change in the middle.
+        client.unpublish(topic)
+        bench.refuse(image_of(hu), "bad_image", "no slice_pose with the image's stamp")
+
+
+def test_start_values_that_cannot_be_end_the_node_with_a_sentence(tmp_path):
+    file = tmp_path / "broken.yaml"
+    file.write_text("register_node: [")
+    faults = {
+        ("-p", "threshold:=1e9"): "threshold out of range",
+        ("-p", "threshold:=2000"): "expecting type 'DOUBLE'",
+        ("-p", "pixel_spacing:=[-1.0, 1.0]"): "pixel_spacing is [-1.0, 1.0], expected two positive numbers",
+        ("-p", "matcher:=guess"): "matcher is 'guess', expected one of",
+        ("--params-file", str(file)): "Couldn't parse params file",
+    }
+    processes = {fault: NodeProcess("register_node", "--ros-args", *fault) for fault in faults}
+    try:
+        for fault, process in processes.items():
+            assert process.wait() == 1, process.output
+            assert "cannot start: " in process.output
+            assert faults[fault] in process.output
+            assert "Traceback" not in process.output
+    finally:
+        for process in processes.values():
+            process.close()
+
+
+def test_malformed_parameter_request_leaves_the_node_alive(bench):
+    unknown_type = ParameterMessage(name="threshold", value=ParameterValue(type=99))
+    requests = bench.client.node.create_client(SetParametersAtomically, f"{bench.node}/set_parameters_atomically")
+    bench.client.wait_for(requests.service_is_ready, "the parameter service")
+    requests.call_async(SetParametersAtomically.Request(parameters=[unknown_type]))
+    hu, slice_from_frame = rendered(18)
+    assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+    bench.client.node.destroy_client(requests)
+
+
+def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
+    def broken(*_: object) -> None:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr(register_node, "register_slice", broken)
+    published: list[DiagnosticStatus] = []
+    os.environ.update(ROS_ENVIRONMENT)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = register_node.RegisterNode()
+        monkeypatch.setattr(node, "_publish_status", lambda status, _header: published.append(status))
+        node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
+        node._on_image(image_of(rendered(19)[0]))
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    (status,) = published
+    assert values_of(status)["reason"] == "bad_image"
+    assert status.message == "internal error: RuntimeError: out of luck"
+    assert "Traceback" in capfd.readouterr().err

@@ -1,0 +1,281 @@
+"""Spots in, pose or refusal out: right, ambiguous, or refused with the reason that fits; never wrong."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_slice, register_spots
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import rotation_angle
+from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.registration import MAX_SPOTS
+from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, centred_pose, random_pose, random_spot_set
+
+SCANNER = ScannerSettings()
+SCALE = SCANNER.scale
+
+
+def is_wrong(found: Pose, truth: Pose, mm: float = 1.5, degrees: float = 2.0) -> bool:
+    turn = np.degrees(rotation_angle(found.rotation @ truth.rotation.T))
+    return bool(np.linalg.norm(found.translation - truth.translation) > mm or turn > degrees)
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return load_frame("cube6")
+
+
+def test_exact_spots_give_the_exact_pose_and_matches(cube):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        truth = random_pose(rng, cube, SCANNER)
+        spots, _ = project(cube, truth, SCALE)
+        order = rng.permutation(len(spots))
+        result = register_spots(spots[order], cube, SCALE)
+        assert result
+        np.testing.assert_allclose(result.scanner_from_frame.translation, truth.translation, atol=1e-6)
+        np.testing.assert_allclose(result.scanner_from_frame.rotation, truth.rotation, atol=1e-8)
+        assert [match.line for match in result.matches] == list(cube.line_names)
+        assert all(order[match.spot] == match.line_index for match in result.matches)
+        assert result.estimate.residual_rms_mm < 1e-6
+
+
+def test_result_does_not_depend_on_the_order_of_the_spots_and_is_deterministic(cube):
+    rng = np.random.default_rng(2)
+    problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, visible_rods=6, false_spots=10))
+    first = register_spots(problem.spots_px, cube, SCALE)
+    again = register_spots(problem.spots_px, cube, SCALE)
+    shuffled = register_spots(problem.spots_px[rng.permutation(len(problem.spots_px))], cube, SCALE)
+    assert first
+    assert again
+    assert shuffled
+    np.testing.assert_array_equal(first.scanner_from_frame.rotation, again.scanner_from_frame.rotation)
+    np.testing.assert_allclose(first.scanner_from_frame.translation, shuffled.scanner_from_frame.translation, atol=1e-5)
+    assert first.estimate.log10_false_alarms == pytest.approx(shuffled.estimate.log10_false_alarms, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("visible", "false_spots", "noise_px", "least_accepted"),
+    [(6, 0, 0.5, 0.99), (6, 8, 0.5, 0.99), (6, 24, 0.5, 0.98), (5, 8, 0.05, 0.97), (4, 8, 0.5, 0.0), (5, 24, 0.5, 0.0)],
+)
+def test_false_spots_and_missing_rods(cube, visible, false_spots, noise_px, least_accepted):
+    rng = np.random.default_rng(100 * visible + false_spots)
+    settings = SpotSetSettings(SCANNER, visible, false_spots, noise_px)
+    trials, accepted = 100, 0
+    for _ in range(trials):
+        problem = random_spot_set(rng, cube, settings)
+        result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=0.3))
+        if result:
+            accepted += 1
+            # The pose may be off by what its own covariance says, which few rods make large; not by more.
+            found, estimate = result.scanner_from_frame, result.estimate
+            offset = np.linalg.norm(found.translation - problem.slice_from_frame.translation)
+            assert offset <= 5 * estimate.position_std_mm
+            assert not is_wrong(found, problem.slice_from_frame, 2.0, 3.0)
+    print(f"{accepted} of {trials} accepted")
+    assert accepted >= least_accepted * trials
+
+
+@pytest.mark.parametrize("name", ["cube6", "leksell_ct", "zframe"])
+def test_clutter_alone_is_never_accepted(name):
+    rng = np.random.default_rng(4)
+    frame = load_frame(name)
+    for _ in range(40):
+        spots = rng.uniform(0, 512, (rng.integers(5, 31), 2))
+        result = register_spots(spots, frame, SCALE)
+        assert not result
+        assert result.reason in ("no_consensus", "too_few_spots")
+
+
+def test_any_orientation_without_prior(cube):
+    """All around, not only within 20 degrees; the twin of a pose, where there is one, makes it ambiguous, not wrong."""
+    rng = np.random.default_rng(5)
+    outcomes = {"accepted": 0, "ambiguous": 0, "no_consensus": 0}
+    while sum(outcomes.values()) < 60:
+        rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+        truth = Pose(rotation, np.array([128.0, 128.0, 0.0]) + rng.uniform(-15, 15, 3))
+        spots, cuts = project(cube, truth, SCALE)
+        if cuts.inside.sum() < 6:
+            continue
+        result = register_spots(spots + rng.normal(0, 0.1, spots.shape), cube, SCALE)
+        outcomes["accepted" if result else result.reason] += 1
+        if result:
+            assert not is_wrong(result.scanner_from_frame, truth)
+    print(outcomes)
+    assert outcomes["accepted"] >= 54
+
+
+@pytest.mark.parametrize(
+    ("name", "poses", "least_accepted"), [("leksell_ct", (4, 5, 6, 7, 8), 3), ("zframe", (2,), 10)]
+)
+def test_symmetric_frames_are_ambiguous_until_told_how_they_stand(name, poses, least_accepted):
+    """Parallel rods, the slice nearly at right angles to them: the normal case of these frames.
+
+    The Leksell box has but two directions of rods: the sign of a small tilt to the front is often not to be seen.
+    """
+    frame = load_frame(name)
+    scanner = ScannerSettings(shape=(640, 640))
+    rng = np.random.default_rng(6)
+    accepted = 0
+    for _ in range(10):
+        truth = random_pose(rng, frame, scanner, max_tilt_deg=4.0, max_offset_mm=10.0, max_depth_mm=15.0)
+        spots, _ = project(frame, truth, SCALE)
+        spots = spots + rng.normal(0, 0.2, spots.shape)
+        blind = register_spots(spots, frame, SCALE)
+        assert not blind
+        assert blind.reason == "ambiguous"
+        assert len(blind.estimates) in poses
+        told = register_spots(spots, frame, SCALE, RegistrationOptions(max_rotation_deg=40.0))
+        if not told:
+            assert told.reason == "ambiguous"
+            assert len(told.estimates) == 2
+            continue
+        accepted += 1
+        error = np.append(
+            told.scanner_from_frame.translation - truth.translation,
+            Rotation.from_matrix(told.scanner_from_frame.rotation @ truth.rotation.T).as_rotvec(),
+        )
+        # Weakly determined directions may be far off; by what the covariance says.
+        assert error @ np.linalg.solve(told.covariance, error) < 40.0
+    assert accepted >= least_accepted
+
+
+def test_parallel_rods_among_false_spots():
+    rng = np.random.default_rng(8)
+    frame = load_frame("zframe")
+    accepted = 0
+    for _ in range(20):
+        settings = SpotSetSettings(SCANNER, visible_rods=7, false_spots=12, noise_px=0.3, max_tilt_deg=6.0)
+        problem = random_spot_set(rng, frame, settings)
+        result = register_spots(problem.spots_px, frame, SCALE, RegistrationOptions(max_rotation_deg=40.0))
+        if result:
+            accepted += 1
+            assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame, 2.0, 5.0)
+    assert accepted >= 19
+
+
+def test_prior_is_about_the_scanner_not_the_slice(cube):
+    """With an oblique slice, the nominal orientation is that of the frame in the scanner."""
+    rng = np.random.default_rng(9)
+    oblique = Pose(Rotation.from_euler("xyz", [30, -20, 60], degrees=True).as_matrix(), np.array([10.0, -40.0, 700.0]))
+    truth = random_pose(rng, cube, SCANNER)
+    spots, _ = project(cube, truth, SCALE)
+    expected = oblique @ truth
+    told = RegistrationOptions(nominal_orientation=tuple(expected.quaternion_xyzw), max_rotation_deg=5.0)
+    result = register_spots(spots, cube, SCALE, told, scanner_from_slice=oblique)
+    assert result
+    np.testing.assert_allclose(result.scanner_from_frame.translation, expected.translation, atol=1e-5)
+    np.testing.assert_allclose(result.scanner_from_frame.rotation, expected.rotation, atol=1e-7)
+    in_slice = RegistrationOptions(nominal_orientation=tuple(truth.quaternion_xyzw), max_rotation_deg=5.0)
+    assert not register_spots(spots, cube, SCALE, in_slice, scanner_from_slice=oblique)
+
+
+def test_spots_beyond_a_rods_end_are_not_on_it(cube):
+    truth = centred_pose(cube, SCANNER)
+    far = Pose(truth.rotation, truth.translation + np.array([0.0, 0.0, 45.0]))  # the cube ends 15 mm before the slice
+    spots, cuts = project(cube, far, SCALE)
+    assert not cuts.inside.any()
+    assert not register_spots(spots, cube, SCALE)
+
+
+def test_anisotropic_pixels_and_shear(cube):
+    scale = PixelScale(0.45, 0.6, 0.02)
+    truth = random_pose(np.random.default_rng(10), cube, SCANNER)
+    spots, _ = project(cube, truth, scale)
+    result = register_spots(spots, cube, scale)
+    assert result
+    np.testing.assert_allclose(result.scanner_from_frame.translation, truth.translation, atol=1e-5)
+    # The same spots with the axes of the scale exchanged are another shape: no pose may come of it.
+    assert not register_spots(spots, cube, PixelScale(0.6, 0.45))
+
+
+def test_wrong_scale_is_refused_not_absorbed(cube):
+    rng = np.random.default_rng(11)
+    for _ in range(20):
+        truth = random_pose(rng, cube, SCANNER)
+        spots, _ = project(cube, truth, SCALE)
+        assert not register_spots(spots, cube, PixelScale(0.55, 0.55), RegistrationOptions(spot_noise_px=0.1))
+
+
+class TestRefusals:
+    def test_too_few_spots(self, cube):
+        for spots in (np.empty((0, 2)), [], [[1.0, 2.0]], np.ones((3, 2))):
+            result = register_spots(spots, cube, SCALE)
+            assert not result
+            assert result.reason == "too_few_spots"
+            assert "4 are needed" in result.message
+
+    def test_too_many_spots_are_refused_at_once(self, cube):
+        spots = np.random.default_rng(0).uniform(0, 512, (MAX_SPOTS + 1, 2))
+        result = register_spots(spots, cube, SCALE)
+        assert not result
+        assert result.reason == "no_consensus"
+        assert str(MAX_SPOTS) in result.message
+
+    def test_one_place_and_one_line(self, cube):
+        for spots in (np.full((8, 2), 100.0), np.column_stack([np.linspace(0, 500, 8), np.full(8, 3.0)])):
+            result = register_spots(spots, cube, SCALE)
+            assert not result
+            assert result.reason == "no_consensus"
+
+    def test_inaccurate_by_its_residual(self, cube):
+        """Told a noise far below the real one, the rods still match, but the residual cannot be believed."""
+        rng = np.random.default_rng(12)
+        reasons = []
+        for _ in range(30):
+            problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.5))
+            result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=0.08))
+            reasons.append("accepted" if result else result.reason)
+            if result:
+                assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame, 2.0, 3.0)
+        assert "inaccurate" in reasons
+
+    def test_inaccurate_by_its_standard_deviation(self, cube):
+        truth = random_pose(np.random.default_rng(13), cube, SCANNER)
+        spots, _ = project(cube, truth, SCALE)
+        result = register_spots(spots, cube, SCALE, RegistrationOptions(max_position_std_mm=0.01))
+        assert not result
+        assert result.reason == "inaccurate"
+        assert "0.01 mm" in result.message
+
+    def test_degenerate_names_the_direction(self):
+        """At right angles to a Leksell box, the turn about the line across its plates is of second order."""
+        frame = load_frame("leksell_ct")
+        truth = centred_pose(frame, SCANNER)
+        spots, _ = project(frame, truth, SCALE)
+        options = RegistrationOptions(max_rotation_deg=30.0, spot_noise_px=3.0, max_position_std_mm=1000.0)
+        result = register_spots(spots, frame, SCALE, options)
+        assert not result
+        assert result.reason == "degenerate"
+        axis = np.array(re.findall(r"-?\d+\.\d*", result.message)[:3], dtype=float)
+        assert abs(axis[0]) > 0.99, result.message
+
+    def test_three_rods_can_never_be_verified(self):
+        frame = Frame("three", tuple("abc"), np.eye(3) * 30, -np.eye(3)[::-1] * 30 + 5, np.ones(3))
+        result = register_spots(np.random.default_rng(0).uniform(0, 100, (6, 2)), frame, SCALE)
+        assert not result
+        assert result.reason == "no_consensus"
+
+    @pytest.mark.parametrize(
+        ("spots", "message"),
+        [
+            (np.ones((4, 3)), r"shape \(4, 3\)"),
+            (np.ones(8), r"shape \(8,\)"),
+            (np.full((6, 2), np.nan), "finite"),
+            ([[1.0, np.inf]] * 6, "finite"),
+        ],
+    )
+    def test_wrong_arguments_are_exceptions(self, cube, spots, message):
+        with pytest.raises(ValueError, match=message):
+            register_spots(spots, cube, SCALE)
+
+
+def test_empty_slice_is_refused(cube):
+    result = register_slice(Slice(np.full((64, 64), -1000.0, dtype=np.float32), SCALE), cube)
+    assert not result
+    assert result.reason == "too_few_spots"

@@ -1,0 +1,138 @@
+"""Spots in drawn images whose centres are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereoreg_ros.geometry.pose import Array
+from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.spots import find_spots
+
+SCALE = PixelScale(0.5, 0.5)
+OPTIONS = RegistrationOptions()
+
+
+def drawn(centres: Array, shape: tuple[int, int] = (60, 80), peak: float = 20_000.0, sigma: float = 1.0) -> Array:
+    """Gaussian blobs over 40 HU."""
+    v, u = np.indices(shape)
+    image = np.full(shape, 40.0)
+    for x, y in centres:
+        image += peak * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * sigma**2))
+    return image
+
+
+def blank(shape: tuple[int, int] = (60, 80)) -> Array:
+    return np.zeros(shape)
+
+
+def spots_of(image: Array, options: RegistrationOptions = OPTIONS, scale: PixelScale = SCALE) -> Array:
+    return find_spots(Slice(image.astype(np.float32), scale), options)
+
+
+class TestCentre:
+    @pytest.mark.parametrize("sigma", [0.8, 1.0, 1.5])
+    def test_of_a_gaussian_blob_is_found_within_a_twentieth_of_a_pixel(self, sigma: float) -> None:
+        rng = np.random.default_rng(1)
+        for _ in range(50):
+            centre = np.array([40.0, 30.0]) + rng.uniform(-0.5, 0.5, 2)
+            spots = spots_of(drawn(centre[None], sigma=sigma))
+            assert spots.shape == (1, 2)
+            np.testing.assert_allclose(spots[0], centre, atol=0.05)
+
+    def test_is_column_first(self) -> None:
+        np.testing.assert_allclose(spots_of(drawn(np.array([[62.0, 11.0]]))), [[62.0, 11.0]], atol=1e-3)
+
+    def test_does_not_depend_on_the_level_of_the_surroundings(self) -> None:
+        image = drawn(np.array([[40.3, 30.2]]))
+        options = RegistrationOptions(threshold=OPTIONS.threshold + 1000)
+        np.testing.assert_allclose(spots_of(image + 1000, options), spots_of(image), atol=1e-3)
+
+    def test_far_more_spots_than_one(self) -> None:
+        centres = np.array([[u + 0.01 * v, v + 0.02 * u] for v in range(10, 55, 10) for u in range(10, 75, 10)])
+        spots = spots_of(drawn(centres))
+        assert spots.shape == centres.shape
+        for centre in centres:
+            assert np.linalg.norm(spots - centre, axis=1).min() < 0.05
+
+    def test_from_top_to_bottom(self) -> None:
+        spots = spots_of(drawn(np.array([[20.0, 50.0], [60.0, 10.0], [40.0, 30.0]])))
+        np.testing.assert_allclose(spots, [[60, 10], [40, 30], [20, 50]], atol=0.05)
+
+
+class TestWhatIsASpot:
+    @pytest.mark.parametrize("shape", [(60, 80), (1, 1), (1, 50), (50, 1), (2, 2), (3, 3)])
+    def test_none_in_an_empty_image(self, shape: tuple[int, int]) -> None:
+        spots = spots_of(blank(shape))
+        assert spots.shape == (0, 2)
+        assert spots.dtype == np.float64
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (2, 2), (60, 80)])
+    def test_none_where_all_is_bright(self, shape: tuple[int, int]) -> None:
+        assert spots_of(np.full(shape, 3000.0)).shape == (0, 2)
+
+    def test_size_limits_are_areas_in_mm2(self) -> None:
+        image = blank()
+        image[10:12, 10:13] = 5000  # 6 pixels
+        image[30:34, 40:44] = 5000  # 16 pixels
+        scale = PixelScale(0.5, 0.4)
+
+        def found(low: float, high: float) -> list[list[float]]:
+            options = RegistrationOptions(min_spot_area_mm2=low, max_spot_area_mm2=high)
+            rounded: list[list[float]] = np.round(spots_of(image, options, scale), 6).tolist()
+            return rounded
+
+        small, large = [11.0, 10.5], [41.5, 31.5]
+        assert found(1.19, 3.21) == [small, large]
+        assert found(1.21, 3.21) == [large]
+        assert found(1.19, 3.19) == [small]
+        assert found(1.21, 3.19) == []
+
+    def test_threshold_is_exclusive(self) -> None:
+        image = blank()
+        image[20:24, 20:24] = 2000
+        assert len(spots_of(image)) == 0
+        image[20:24, 20:24] = 2001
+        assert len(spots_of(image)) == 1
+
+    @pytest.mark.parametrize("negative", [-2000.0, -500.0])
+    def test_threshold_may_be_below_zero(self, negative: float) -> None:
+        image = np.full((40, 40), negative - 500)
+        image[20:23, 10:13] = negative + 500
+        np.testing.assert_allclose(spots_of(image, RegistrationOptions(threshold=negative)), [[11, 21]], atol=1e-9)
+
+    @pytest.mark.parametrize(
+        "place",
+        [np.s_[0:3, 20:23], np.s_[-3:, 20:23], np.s_[20:23, 0:3], np.s_[20:23, -3:], np.s_[0:3, 0:3], np.s_[-3:, -3:]],
+        ids=["top", "bottom", "left", "right", "first corner", "last corner"],
+    )
+    def test_one_that_touches_the_edge_is_dropped(self, place: tuple[slice, slice]) -> None:
+        image = blank()
+        image[place] = 5000
+        assert spots_of(image).shape == (0, 2)
+
+    @pytest.mark.parametrize("v", [1, 56])
+    @pytest.mark.parametrize("u", [1, 76])
+    def test_one_beside_the_edge_is_kept(self, u: int, v: int) -> None:
+        image = blank()
+        image[v : v + 3, u : u + 3] = 5000
+        np.testing.assert_allclose(spots_of(image), [[u + 1, v + 1]], atol=0.5)
+
+    def test_corners_connect(self) -> None:
+        image = blank()
+        image[20:22, 20:22] = 5000
+        image[22:24, 22:24] = 5000
+        np.testing.assert_allclose(spots_of(image), [[21.5, 21.5]], atol=1e-6)
+
+    def test_a_gap_of_one_pixel_parts(self) -> None:
+        image = blank()
+        image[20:23, 20:23] = 5000
+        image[20:23, 24:27] = 5000
+        assert len(spots_of(image)) == 2
+
+    def test_neighbours_do_not_pull_at_each_other(self) -> None:
+        image = blank()
+        image[20:23, 20:23] = 5000
+        image[20:23, 25:28] = 9000
+        np.testing.assert_allclose(spots_of(image), [[21, 21], [26, 21]], atol=0.05)
