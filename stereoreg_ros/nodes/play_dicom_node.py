@@ -20,7 +20,7 @@ from stereoreg_ros.nodes.parameters import Entry, ParameterError, declare
 from stereoreg_ros.nodes.spinning import run
 from stereoreg_ros.nodes.tell_spacing import SpacingTeller
 
-POSE_GRACE_S: Final = 1.0
+POSE_GRACE_S: Final = 5.0
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02
 _QOS: Final = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)

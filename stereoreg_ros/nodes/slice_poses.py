@@ -13,7 +13,7 @@ from sensor_msgs.msg import Image
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.nodes.conversions import MessageError
 
-WAIT_S: Final = 0.5
+WAIT_S: Final = 2.0
 _CAPACITY: Final = 32
 _Stamp: TypeAlias = tuple[int, int]
 
