@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
-from stereoreg_ros.geometry.projection import project, projection_jacobian
+from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.result import Registration
+from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import (
-    MIN_LINES,
-    DegenerateCalibrationError,
     ScaleSolution,
-    solve_linear,
-    solve_newton_raphson,
+    calibrate_linear,
+    calibrate_newton_raphson,
+    calibration_covariance,
 )
 
+_MIN_LINES = 5
 # A scale whose standard error is larger than this share of it is not a measurement worth having.
 _MAX_RELATIVE_ERROR = 0.02
 # A scanner's scale is not off by more; a larger change means wrong matches or a wrong frame.
@@ -61,14 +62,14 @@ def calibrate(registration: Registration) -> Calibration | CalibrationRefusal:
     frame, previous = registration.frame, registration.scale
     lines = np.array([match.line_index for match in registration.matches])
     spots_px = np.array([match.spot_px for match in registration.matches])
-    if len(lines) < MIN_LINES:
+    if len(lines) < _MIN_LINES:
         return CalibrationRefusal(
-            f"calibration refused: {len(lines)} rods are identified in the latest slice, {MIN_LINES} are needed"
+            f"calibration refused: {len(lines)} rods are identified in the latest slice, {_MIN_LINES} are needed"
         )
     try:
-        linear = solve_linear(frame, lines, spots_px)
-        solution = solve_newton_raphson(frame, lines, spots_px)
-    except DegenerateCalibrationError as fault:
+        linear = calibrate_linear(frame, lines, spots_px)
+        solution = calibrate_newton_raphson(frame, lines, spots_px)
+    except DegenerateArrangementError as fault:
         return CalibrationRefusal(f"calibration refused: {fault}")
     if not solution.converged:
         return CalibrationRefusal(
@@ -113,11 +114,7 @@ def _standard_errors(
     frame: Frame, lines: NDArray[np.intp], solution: ScaleSolution, noise_px: float
 ) -> tuple[float, float]:
     """Standard errors of (sx, sy) from the spots' noise, the pose being unknown too."""
-    slice_from_frame = _slice_from_frame(solution)
-    _, cuts = project(frame, slice_from_frame, solution.scale)
-    by_pose, by_scale = projection_jacobian(cuts, slice_from_frame, solution.scale)
-    jacobian = np.concatenate([by_scale[lines, :, :2], by_pose[lines]], axis=2).reshape(-1, 8)
-    covariance = noise_px**2 * np.linalg.pinv(jacobian.T @ jacobian)
+    covariance = calibration_covariance(frame, lines, _slice_from_frame(solution), solution.scale, noise_px)
     return float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1]))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from stereoreg_ros.geometry.pose import rotation_from_quaternion
 
-MATCHERS: Final = ("three_line",)
+MATCHERS: Final = ("three_line", "maurin2009")
 
 
 def _option(default: Any, description: str, low: float | None = None, high: float | None = None) -> Any:

@@ -7,6 +7,7 @@ accepted, or refused with a reason.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -17,14 +18,16 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_from_quaternion
 from stereoreg_ros.geometry.projection import point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.matching import maurin2009, three_line
+from stereoreg_ros.matching.consensus import Spots
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
-from stereoreg_ros.matching.three_line import Spots, match
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
 from stereoreg_ros.spots import find_spots
 from stereoreg_ros.uncertainty import in_scanner_axes
 
 MAX_SPOTS = 300
+_MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
 # Rotation (standard deviation about the weakest axis) beyond which a pose counts as not determined.
 _DEGENERATE_ROTATION_DEG = 10.0
 # Probabilities of a residual as large by the stated noise alone: less than these, and it is not the noise.
@@ -39,6 +42,25 @@ def register_slice(ct_slice: Slice, frame: Frame, options: RegistrationOptions |
     options = options or RegistrationOptions()
     spots_px = find_spots(ct_slice, options)
     return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice)
+
+
+def register_frames(
+    ct_slice: Slice, frames: Sequence[Frame], options: RegistrationOptions | None = None
+) -> list[Registration | Refusal]:
+    """Register several frames from one slice, one result for each, in their order.
+
+    The spots are found once. Those that an accepted frame has taken are not offered to the next; to a frame, another
+    one's spots are false spots. `Match.spot` counts in the spots of that frame's own result.
+    """
+    options = options or RegistrationOptions()
+    spots_px = find_spots(ct_slice, options)
+    results: list[Registration | Refusal] = []
+    for frame in frames:
+        result = register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice)
+        if result:
+            spots_px = np.delete(spots_px, [match.spot for match in result.matches], axis=0)
+        results.append(result)
+    return results
 
 
 def register_spots(
@@ -74,7 +96,7 @@ def register_spots(
 
     spots = _prepare(spots_px, scale, options.spot_noise_px)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
-    hypotheses = match(spots, frame, nominal, options)
+    hypotheses = _MATCHERS[options.matcher](spots, frame, nominal, options)
     estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in hypotheses)
     if not estimates:
         return refuse(

@@ -5,9 +5,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, skew
+from stereoreg_ros.geometry.projection import project, projection_jacobian
+from stereoreg_ros.geometry.slice import PixelScale
+
+
+def cramer_rao_pose(
+    frame: Frame, lines: NDArray[np.intp], slice_from_frame: Pose, scale: PixelScale, noise_px: float
+) -> Array:
+    """Cramer-Rao bound (6, 6) of slice_from_frame (mm, rad; see `Pose.perturbed`) from the spots of the given rods.
+
+    noise_px: standard deviation per axis of the spots. No unbiased method has a smaller covariance.
+    """
+    _, cuts = project(frame, slice_from_frame, scale)
+    jacobian = projection_jacobian(cuts, slice_from_frame, scale)[0][lines].reshape(-1, 6)
+    return np.asarray(noise_px**2 * np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
 
 
 def in_scanner_axes(covariance: Array, scanner_from_slice: Pose) -> Array:

@@ -9,28 +9,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, skew
+from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, rotation_exp
+from stereoreg_ros.geometry.projection import project, projection_jacobian
 from stereoreg_ros.geometry.slice import PixelScale
-
-MIN_LINES = 5
-# Smallest singular value of the normalised system over its largest below which the rods fix no scale.
-_SINGULAR = 1e-6
-_MAX_ITERATIONS = 50
-_CONVERGED = 1e-12
-
-
-class DegenerateCalibrationError(ValueError):
-    """Rods and spots from which no scale follows; the text says why."""
+from stereoreg_ros.solvers.linear_system import SCALE_RANK, LinearSystem, linear_system
+from stereoreg_ros.solvers.newton_raphson import constraint_matrix, minimise
 
 
 @dataclass(frozen=True, eq=False)
 class ScaleSolution:
     """A pixel scale with its pose.
 
-    scale: mm/pixel, without shear; frame_from_slice: mm, its rotation the nearest to [r1 r2 r1xr2];
-    unknowns: x (9,); converged, iterations: of the Newton-Raphson steps, true and 0 for the linear solution.
+    scale: mm/pixel; frame_from_slice: mm, its rotation the nearest to [r1 r2 r1xr2]; unknowns: x (9,);
+    converged, iterations: of the iterative methods; true and 0 for the linear one.
     """
 
     scale: PixelScale
@@ -40,77 +34,92 @@ class ScaleSolution:
     iterations: int
 
 
-def solve_linear(frame: Frame, lines: NDArray[np.intp], spots_px: Array) -> ScaleSolution:
+def calibrate_linear(frame: Frame, lines: NDArray[np.intp], spots_px: Array, with_shear: bool = False) -> ScaleSolution:
     """Linear least squares (Maurin 2009, eq. 10-12) for the spots (n, 2) of the given rods (n,), n >= 5.
 
-    Raises DegenerateCalibrationError where the rods are too few or do not fix the scale.
+    with_shear: read the shear g off l1 . l2 (eq. 4) instead of neglecting it (eq. 5).
+    Raises DegenerateArrangementError, ValueError as `linear_system` does.
     """
-    system = _System(frame, lines, spots_px)
-    return system.solution(system.least_squares(), True, 0)
+    system = linear_system(frame, lines, spots_px, SCALE_RANK)
+    return _solution(system, system.least_squares(), with_shear, True, 0)
 
 
-def solve_newton_raphson(frame: Frame, lines: NDArray[np.intp], spots_px: Array) -> ScaleSolution:
-    """Least squares with the constraint l1 . l2 = 0, by Newton-Raphson from the linear solution (eq. 17-23).
+def calibrate_newton_raphson(frame: Frame, lines: NDArray[np.intp], spots_px: Array) -> ScaleSolution:
+    """Least squares with the constraint l1 . l2 = 0, from the linear solution (eq. 17-23).
 
-    Raises DegenerateCalibrationError as `solve_linear` does, and where a step has no solution.
+    Raises DegenerateArrangementError, ValueError as `linear_system` does.
     """
-    system = _System(frame, lines, spots_px)
-    a, b = system.matrix, system.right_side
-    hessian = 2 * a.T @ a
-    # h(x) = x' C x / 2 = l1 . l2 (half of the paper's h, whose C is this one: the constraint is the same).
-    c = np.zeros((9, 9))
-    c[:3, 3:6] = c[3:6, :3] = np.eye(3)
-    x = system.least_squares()
-    multiplier = 0.0
-    for iteration in range(1, _MAX_ITERATIONS + 1):
-        normal = c @ x
-        kkt = np.zeros((10, 10))
-        kkt[:9, :9] = hessian + multiplier * c
-        kkt[:9, 9] = kkt[9, :9] = normal
-        gradient = hessian @ x - 2 * a.T @ b + multiplier * normal
-        try:
-            step = np.linalg.solve(kkt, -np.append(gradient, x @ normal / 2))
-        except np.linalg.LinAlgError:
-            raise DegenerateCalibrationError("the Newton-Raphson step has no solution") from None
-        x = x + step[:9]
-        multiplier += float(step[9])
-        if np.abs(step[:9]).max() <= _CONVERGED * np.abs(x).max():
-            return system.solution(x, True, iteration)
-    return system.solution(x, False, _MAX_ITERATIONS)
+    system = linear_system(frame, lines, spots_px, SCALE_RANK)
+    x, _, converged, iterations = minimise(system, [(constraint_matrix(0, 3), 0.0)], system.least_squares())
+    return _solution(system, x, False, converged, iterations)
 
 
-class _System:
-    """A x = b of eq. 12, over pixels moved to their centroid and divided by their spread, for good condition."""
+def calibrate_maximum_likelihood(
+    frame: Frame,
+    lines: NDArray[np.intp],
+    spots_px: Array,
+    start: ScaleSolution | None = None,
+    with_shear: bool = False,
+) -> ScaleSolution:
+    """Least squares of the residuals in the image, from `start` or the linear solution: scale and pose together.
 
-    def __init__(self, frame: Frame, lines: NDArray[np.intp], spots_px: Array) -> None:
-        lines = np.asarray(lines)
-        spots_px = np.asarray(spots_px, dtype=np.float64)
-        if spots_px.shape != (len(lines), 2):
-            raise ValueError(f"spots_px has shape {spots_px.shape}, expected ({len(lines)}, 2), a spot for each line")
-        if len(lines) < MIN_LINES:
-            raise DegenerateCalibrationError(f"{len(lines)} rods are identified, the scale needs at least {MIN_LINES}")
-        self.centre = spots_px.mean(axis=0)
-        self.spread = float(np.abs(spots_px - self.centre).max())
-        if self.spread == 0:
-            raise DegenerateCalibrationError("all spots are in one place")
-        homogeneous = np.column_stack([(spots_px - self.centre) / self.spread, np.ones(len(lines))])
-        blocks = homogeneous[:, None, :, None] * skew(frame.directions[lines])[:, :, None, :]
-        self.matrix = blocks.reshape(-1, 9)
-        self.right_side = frame.moments[lines].reshape(-1)
+    Raises DegenerateArrangementError, ValueError as `linear_system` does.
+    """
+    first = start or calibrate_linear(frame, lines, spots_px, with_shear)
+    spots_px = np.asarray(spots_px, dtype=np.float64)
+    slice_from_frame = first.frame_from_slice.inverse()
+    size = 3 if with_shear else 2
 
-    def least_squares(self) -> Array:
-        left, values, right = np.linalg.svd(self.matrix, full_matrices=False)
-        if values[-1] < _SINGULAR * values[0]:
-            raise DegenerateCalibrationError(
-                f"the rods do not fix the scale: singular values down to {values[-1] / values[0]:.1e} of the largest"
-            )
-        x: Array = right.T @ ((left.T @ self.right_side) / values)
-        return x
+    def unpack(step: Array) -> tuple[PixelScale, Pose]:
+        shear = first.scale.shear + step[2] if with_shear else 0.0
+        scale = PixelScale(first.scale.sx + step[0], first.scale.sy + step[1], shear)
+        moved = Pose(
+            rotation_exp(step[size + 3 :]) @ slice_from_frame.rotation,
+            slice_from_frame.translation + step[size : size + 3],
+        )
+        return scale, moved
 
-    def solution(self, normalised: Array, converged: bool, iterations: int) -> ScaleSolution:
-        l1, l2 = normalised[:3] / self.spread, normalised[3:6] / self.spread
-        t = normalised[6:] - l1 * self.centre[0] - l2 * self.centre[1]
-        sx, sy = float(np.linalg.norm(l1)), float(np.linalg.norm(l2))
-        r1, r2 = l1 / sx, l2 / sy
-        rotation = nearest_rotation(np.column_stack([r1, r2, np.cross(r1, r2)]))
-        return ScaleSolution(PixelScale(sx, sy), Pose(rotation, t), np.concatenate([l1, l2, t]), converged, iterations)
+    def residuals(step: Array) -> Array:
+        scale, moved = unpack(step)
+        predicted, _ = project(frame, moved, scale)
+        return np.nan_to_num((predicted[lines] - spots_px).ravel(), nan=1e6)
+
+    low = np.full(size + 6, -np.inf)
+    low[:2] = -0.9 * first.scale.sx, -0.9 * first.scale.sy  # a scale is positive
+    fit = least_squares(residuals, np.zeros(size + 6), bounds=(low, np.inf), x_scale="jac", xtol=1e-14, ftol=1e-14)
+    scale, moved = unpack(fit.x)
+    frame_from_slice = moved.inverse()
+    columns = frame_from_slice.rotation[:, :2] @ scale.matrix
+    unknowns = np.concatenate([columns[:, 0], columns[:, 1], frame_from_slice.translation])
+    return ScaleSolution(scale, frame_from_slice, unknowns, bool(fit.success), int(fit.nfev))
+
+
+def calibration_covariance(
+    frame: Frame, lines: NDArray[np.intp], slice_from_frame: Pose, scale: PixelScale, noise_px: float
+) -> Array:
+    """Cramer-Rao bound (8, 8) of (sx, sy) in mm/pixel and the pose slice_from_frame (mm, rad; see `Pose.perturbed`).
+
+    noise_px: standard deviation per axis of the spots. A direction that nothing determines gets no finite bound: the
+    pseudo-inverse leaves it out, so use it for rods that fix the scale.
+    """
+    _, cuts = project(frame, slice_from_frame, scale)
+    by_pose, by_scale = projection_jacobian(cuts, slice_from_frame, scale)
+    jacobian = np.concatenate([by_scale[lines, :, :2], by_pose[lines]], axis=2).reshape(-1, 8)
+    covariance: Array = noise_px**2 * np.linalg.pinv(jacobian.T @ jacobian)
+    return covariance
+
+
+def _solution(
+    system: LinearSystem, normalised: Array, with_shear: bool, converged: bool, iterations: int
+) -> ScaleSolution:
+    l1, l2, t = system.affine(normalised)
+    sx = float(np.linalg.norm(l1))
+    r1 = l1 / sx
+    shear = float(l1 @ l2) / sx if with_shear else 0.0
+    rest = l2 - shear * r1
+    sy = float(np.linalg.norm(rest))
+    r2 = rest / sy
+    rotation = nearest_rotation(np.column_stack([r1, r2, np.cross(r1, r2)]))
+    return ScaleSolution(
+        PixelScale(sx, sy, shear), Pose(rotation, t), np.concatenate([l1, l2, t]), converged, iterations
+    )

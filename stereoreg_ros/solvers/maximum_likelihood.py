@@ -8,8 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, rotation_exp
+from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, rotation_exp
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers.ls_tz import solve_ls_tz
+from stereoreg_ros.solvers.newton_raphson import solve_newton_raphson
+from stereoreg_ros.solvers.pose_solution import PoseSolution, is_same
 
 # Relative decrease of chi-square below which a step no longer matters.
 _STILL = 1e-9
@@ -97,6 +101,40 @@ def refine(
         active = active[~(settled & better) & ~stuck]
     cuts = cut(frame, rotations, translations)
     return Refined(rotations, translations, chi_square, information, converged, cuts)
+
+
+def solve_maximum_likelihood(
+    frame: Frame, lines: NDArray[np.intp], spots_px: Array, scale: PixelScale
+) -> list[PoseSolution]:
+    """Least squared residuals in the image, from every closed-form and Newton-Raphson solution; least residual first.
+
+    Raises DegenerateArrangementError, ValueError as `linear_system` does.
+    """
+    starts = [*solve_newton_raphson(frame, lines, spots_px, scale), *solve_ls_tz(frame, lines, spots_px, scale)]
+    if not starts:
+        return []
+    slice_from_frame = [start.frame_from_slice.inverse() for start in starts]
+    spots_mm = np.zeros((len(frame), 2))
+    used = np.zeros(len(frame), dtype=bool)
+    spots_mm[lines], used[lines] = scale.to_mm(np.asarray(spots_px, dtype=np.float64)), True
+    m = len(starts)
+    refined = refine(
+        frame,
+        np.array([pose.rotation for pose in slice_from_frame]),
+        np.array([pose.translation for pose in slice_from_frame]),
+        np.broadcast_to(spots_mm, (m, *spots_mm.shape)),
+        np.broadcast_to(used, (m, len(frame))),
+        scale.inverse_matrix,
+    )
+    found: list[tuple[float, PoseSolution]] = []
+    for i in np.argsort(refined.chi_square, kind="stable"):
+        if not refined.converged[i]:
+            continue
+        found_pose = Pose(nearest_rotation(refined.rotations[i]), refined.translations[i]).inverse()
+        solution = PoseSolution(found_pose, True, 0)
+        if not any(is_same(solution, other) for _, other in found):
+            found.append((float(refined.chi_square[i]), solution))
+    return [solution for _, solution in found]
 
 
 def _normal_equations(
