@@ -70,7 +70,7 @@ def calibrate(registration: Registration) -> Calibration | CalibrationRefusal:
         linear = calibrate_linear(frame, lines, spots_px)
         solution = calibrate_newton_raphson(frame, lines, spots_px)
     except DegenerateArrangementError as fault:
-        return CalibrationRefusal(f"calibration refused: {fault}")
+        return CalibrationRefusal(f"calibration refused: the rods do not fix the scale, {fault}")
     if not solution.converged:
         return CalibrationRefusal(
             f"calibration refused: no convergence in {solution.iterations} Newton-Raphson steps, the linear solution "

@@ -97,6 +97,7 @@ def _parser() -> _Parser:
     parser.add_argument("--version", action="version", version=f"stereoreg {_version()}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_register(commands)
+    _add_reproduce(commands)
     return parser
 
 
@@ -315,14 +316,55 @@ def _summary(outcomes: Counter[str]) -> str:
     return summary
 
 
+def _add_reproduce(commands: argparse._SubParsersAction[_Parser]) -> None:
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="repeat the results section of Maurin 2009, simulated",
+        description="Repeats section 6 of Maurin 2009 with simulated data and writes a report (report.md, PNG, CSV) "
+        "that puts the paper's figures beside ours. The full run takes about a quarter of an hour.",
+        allow_abbrev=False,
+    )
+    reproduce.add_argument(
+        "--output", metavar="DIR", type=Path, required=True, help="folder for the report, made where it is missing"
+    )
+    reproduce.add_argument("--quick", action="store_true", help="fewer poses and levels: done within two minutes")
+    reproduce.add_argument("--seed", metavar="N", type=int, default=0, help="seed of everything random (default: 0)")
+    reproduce.set_defaults(command=_reproduce)
+
+
+def _reproduce(arguments: argparse.Namespace) -> int:
+    """`stereoreg reproduce`."""
+    if arguments.seed < 0:
+        raise WrongCallError(f"--seed is {arguments.seed}, expected 0 or more")
+    try:
+        # Only here: nothing else in the package needs matplotlib.
+        from stereoreg_ros.reproduction.run import reproduce
+    except ModuleNotFoundError as missing:
+        if missing.name is None or missing.name.split(".")[0] != "matplotlib":
+            raise
+        raise WrongCallError(
+            "reproduce draws plots with matplotlib, which is not installed; it is python3-matplotlib in Ubuntu"
+        ) from None
+    from stereoreg_ros.reproduction.effort import FULL, QUICK
+
+    _make_folder("--output", arguments.output)
+    report = reproduce(arguments.output, QUICK if arguments.quick else FULL, arguments.seed)
+    _print(str(report))
+    return OK
+
+
+def _make_folder(option: str, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WrongCallError(f"{option}: {folder} cannot be made a folder: {error.strerror}") from None
+
+
 class _Pictures:
     """Writes overlays to a folder, which is made; each under a name of its own."""
 
     def __init__(self, folder: Path) -> None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise WrongCallError(f"--overlay: {folder} cannot be made a folder: {error.strerror}") from None
+        _make_folder("--overlay", folder)
         self._folder = folder
         self._taken: set[str] = set()
 

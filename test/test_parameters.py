@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
-from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.options import MATCHERS, RegistrationOptions
 
 CONFIG = Path(__file__).resolve().parent.parent / "config" / "register_node.yaml"
 DEFAULTS = {entry.name: entry.default for entry in ENTRIES}
@@ -103,3 +103,10 @@ def test_values_reach_their_places():
 def test_faulty_value_is_named(name, value, sentence):
     with pytest.raises(ValueError, match=sentence):
         NodeSettings.from_parameters({**DEFAULTS, name: value})
+
+
+@pytest.mark.parametrize("matcher", MATCHERS)
+def test_every_matcher_can_be_chosen(matcher):
+    (entry,) = [entry for entry in ENTRIES if entry.name == "matcher"]
+    assert matcher in entry.description
+    assert NodeSettings.from_parameters(DEFAULTS | {"matcher": matcher}).options.matcher == matcher

@@ -34,15 +34,3 @@ def test_cube_with_false_spots_and_a_missing_rod():
     assert position.max() <= 1.5
     assert rotation.max() <= 2.0
     assert accepted >= 0.99 * SLICES
-
-
-def test_two_cubes_in_one_slice_are_registered_one_by_one():
-    """Each cube's spots are false ones to the other; a prior tells the two apart, which are of one kind."""
-    frame = load_frame("cube6")
-    rng = np.random.default_rng(7)
-    settings = ScannerSettings()
-    first = random_pose(rng, frame, settings, max_offset_mm=0.0)
-    other = load_frame("zframe")
-    ct_slice = render_slice([PlacedFrame(frame, first)], settings, rng)
-    assert register_slice(ct_slice, frame)
-    assert not register_slice(ct_slice, other)

@@ -35,9 +35,13 @@ class DegenerateArrangementError(ValueError):
     """
 
     def __init__(self, arrangements: list[Arrangement], condition: float) -> None:
-        self.names = tuple(dict.fromkeys(one.name for one in arrangements)) or ("ill_conditioned",)
+        by_name: dict[str, list[Arrangement]] = {}
+        for one in arrangements:
+            by_name.setdefault(one.name, []).append(one)
+        self.names = tuple(by_name) or ("ill_conditioned",)
         self.condition = condition
-        found = "; ".join(str(one) for one in arrangements[:4]) or "no arrangement of section 3.1"
+        told = [str(alike[0]) + (f" and {len(alike) - 1} more" if len(alike) > 1 else "") for alike in by_name.values()]
+        found = "; ".join(told) or "no arrangement of section 3.1"
         super().__init__(f"degenerate: {found}; the system has condition number {condition:.3g}")
 
 

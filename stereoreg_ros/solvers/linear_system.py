@@ -22,6 +22,8 @@ from stereoreg_ros.solvers.arrangement import (
 # Condition number beyond which the system says nothing: spots are known to about a thousandth of their spread.
 MAX_CONDITION = 1000.0
 POSE_RANK, SCALE_RANK = 8, 9
+# Spots that all lie within so little of their centroid, pixel or mm, are one place and the noise about it.
+LEAST_SPREAD = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,8 @@ def linear_system(frame: Frame, lines: NDArray[np.intp], points: Array, rank: in
     n = len(lines)
     if 2 * n < rank:
         raise DegenerateArrangementError([Arrangement("too_few_lines", tuple(range(n)), float("inf"))], float("inf"))
+    if np.abs(points - points.mean(axis=0)).max() < LEAST_SPREAD:
+        raise DegenerateArrangementError(degenerate_arrangements(frame, lines, points), float("inf"))
     condition = condition_number(frame, lines, _without_noise(frame, lines, points), rank)
     if condition > MAX_CONDITION:
         raise DegenerateArrangementError(degenerate_arrangements(frame, lines, points), condition)
@@ -95,8 +99,16 @@ def _without_noise(frame: Frame, lines: NDArray[np.intp], points: Array) -> Arra
     """The points with those of coplanar rods put on one line, where they belong: noise must not hide a degeneracy."""
     clean = points.copy()
     row_of = {int(line): row for row, line in enumerate(lines)}
+    planes: list[set[int]] = []
     for triple in three_coplanar_lines(frame, lines):
-        rows = [row_of[member] for member in triple.members]
+        # Two rods span a plane: triples that share two lie in one, and their spots on one line.
+        plane = set(triple.members)
+        for other in [known for known in planes if len(known & plane) >= 2]:
+            planes.remove(other)
+            plane |= other
+        planes.append(plane)
+    for plane in planes:
+        rows = sorted(row_of[member] for member in plane)
         centre = clean[rows].mean(axis=0)
         along = np.linalg.svd(clean[rows] - centre)[2][0]
         clean[rows] = centre + np.outer((clean[rows] - centre) @ along, along)

@@ -26,15 +26,11 @@ class PoseSolution:
     iterations: int = 0
 
 
-# Solutions from different starts that are no further apart are one.
-_SAME_RAD, _SAME_MM = 1e-6, 1e-6
-
-
-def is_same(one: PoseSolution, other: PoseSolution) -> bool:
-    """Whether two solutions are one, found from different starts."""
+def is_same(one: PoseSolution, other: PoseSolution, within_mm: float = 1e-6, within_rad: float = 1e-6) -> bool:
+    """Whether two solutions are one, found from different starts: no further apart than the solver's precision."""
     p, q = one.frame_from_slice, other.frame_from_slice
-    near = np.linalg.norm(p.translation - q.translation) < _SAME_MM
-    return bool(near and rotation_angle(p.rotation @ q.rotation.T) < _SAME_RAD)
+    near = np.linalg.norm(p.translation - q.translation) < within_mm
+    return bool(near and rotation_angle(p.rotation @ q.rotation.T) < within_rad)
 
 
 # (frame, lines (n,), spots (n, 2) in pixel, scale) -> solutions, best first, maybe none.

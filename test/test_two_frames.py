@@ -1,0 +1,142 @@
+"""Two different cubes in one slice, as on the paper's rail: to each the other's spots are false ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle
+from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.result import Refusal, Registration
+from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, random_pose, render_slice
+
+SCANNER = ScannerSettings()
+# Between the cubes' middles; the paper's stand 118.29 mm apart.
+APART_MM = 118.0
+FIRST = load_frame("cube6")
+SECOND = Frame(
+    "another cube",
+    tuple("ghijkl"),
+    np.array(
+        [[-30.0, 0, -30], [10, 30, -30], [30, 10, -30], [0, -30, -30], [-20, -20, -30], [20, -10, -30]],
+    ),
+    np.array([[0.0, 30, 30], [30, 0, 30], [10, -30, 30], [-30, -10, 30], [15, -15, 30], [-15, 15, 30]]),
+    np.ones(6),
+)
+
+
+def scene(seed: int) -> tuple[Slice, Pose, Pose]:
+    """A slice through both cubes, each tilted on its own, and their slice_from_frame."""
+    rng = np.random.default_rng(seed)
+    middle = centred_pose(FIRST, SCANNER, share=(0.5, 0.45)).translation
+    poses = []
+    for frame, side in ((FIRST, -0.5), (SECOND, 0.5)):
+        nominal = Pose(np.eye(3), middle + np.array([side * APART_MM, 0.0, 0.0]))
+        # Turned about the cube's middle alone: the distance between the middles is kept, along the slice.
+        poses.append(
+            random_pose(rng, frame, SCANNER, max_tilt_deg=15, max_offset_mm=0, max_depth_mm=6, nominal=nominal)
+        )
+    placed = [PlacedFrame(frame, pose) for frame, pose in zip((FIRST, SECOND), poses, strict=True)]
+    return render_slice(placed, SCANNER, rng), poses[0], poses[1]
+
+
+def assert_right(result: Registration | Refusal, frame: Frame, true: Pose) -> None:
+    assert isinstance(result, Registration), result.message
+    assert result.frame is frame
+    found = result.scanner_from_frame
+    assert np.linalg.norm(found.translation - true.translation) < 0.3
+    assert np.degrees(rotation_angle(found.rotation @ true.rotation.T)) < 0.5
+    assert result.estimate.inliers == 6
+
+
+def taken(result: Registration) -> Array:
+    return np.array([match.spot_px for match in result.matches])
+
+
+@pytest.fixture(scope="module")
+def scenes() -> Sequence[tuple[Slice, Pose, Pose]]:
+    return [scene(seed) for seed in range(15)]
+
+
+def test_both_are_registered_in_one_call(scenes) -> None:
+    for ct_slice, first, second in scenes:
+        results = register_frames(ct_slice, [FIRST, SECOND])
+        assert len(results) == 2
+        assert_right(results[0], FIRST, first)
+        assert_right(results[1], SECOND, second)
+
+
+def test_taken_spots_are_not_offered_again(scenes) -> None:
+    for ct_slice, first, second in scenes[:4]:
+        results = register_frames(ct_slice, [FIRST, SECOND])
+        one, other = results
+        assert isinstance(one, Registration)
+        assert isinstance(other, Registration)
+        assert len(one.spots_px) == 12
+        assert len(other.spots_px) == 6
+        # What is left is the second cube's own, and each match counts in the spots of its own result.
+        for result, frame, pose in ((one, FIRST, first), (other, SECOND, second)):
+            for match in result.matches:
+                np.testing.assert_array_equal(result.spots_px[match.spot], match.spot_px)
+                expected = project(frame, pose, SCANNER.scale)[0][match.line_index]
+                assert np.linalg.norm(match.spot_px - expected) < 0.5
+        apart = np.linalg.norm(taken(one)[:, None] - taken(other)[None], axis=2)
+        assert apart.min() > 2
+        together = np.concatenate([taken(one), taken(other)])
+        np.testing.assert_array_equal(np.sort(together, axis=0), np.sort(one.spots_px, axis=0))
+
+
+def test_their_order_does_not_matter(scenes) -> None:
+    for ct_slice, first, second in scenes[:6]:
+        there, back = register_frames(ct_slice, [FIRST, SECOND]), register_frames(ct_slice, [SECOND, FIRST])
+        assert_right(back[0], SECOND, second)
+        assert_right(back[1], FIRST, first)
+        for one, other in zip(there, reversed(back), strict=True):
+            assert isinstance(one, Registration)
+            assert isinstance(other, Registration)
+            np.testing.assert_allclose(
+                one.scanner_from_frame.translation, other.scanner_from_frame.translation, atol=1e-4
+            )
+            np.testing.assert_allclose(one.scanner_from_frame.rotation, other.scanner_from_frame.rotation, atol=1e-6)
+
+
+@pytest.mark.parametrize("absent_is_first", [False, True])
+def test_one_that_is_not_there_is_refused_and_takes_nothing(absent_is_first: bool) -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(100 + seed)
+        true = random_pose(rng, SECOND, SCANNER, max_tilt_deg=15)
+        ct_slice = render_slice([PlacedFrame(SECOND, true)], SCANNER, rng)
+        frames = [FIRST, SECOND] if absent_is_first else [SECOND, FIRST]
+        results = register_frames(ct_slice, frames)
+        absent, present = (results[0], results[1]) if absent_is_first else (results[1], results[0])
+        assert_right(present, SECOND, true)
+        assert isinstance(absent, Refusal)
+        assert absent.frame is FIRST
+        # Refused on all spots when asked first, on those that are left when asked last.
+        assert absent.reason in (("no_consensus", "inaccurate") if absent_is_first else ("too_few_spots",))
+
+
+def test_one_frame_is_as_by_register_slice(scenes) -> None:
+    ct_slice, first, _ = scenes[0]
+    options = RegistrationOptions(spot_noise_px=0.1)
+    (alone,) = register_frames(ct_slice, [FIRST], options)
+    assert_right(alone, FIRST, first)
+    same = register_slice(ct_slice, FIRST, options)
+    assert isinstance(alone, Registration)
+    assert isinstance(same, Registration)
+    np.testing.assert_array_equal(alone.scanner_from_frame.translation, same.scanner_from_frame.translation)
+    assert alone.options is options
+    assert register_frames(ct_slice, [], options) == []
+
+
+def test_the_same_cube_twice_is_two_cubes(scenes) -> None:
+    """Asked for twice where it stands once, the second time it is gone."""
+    ct_slice, first, _ = scenes[1]
+    one, again = register_frames(ct_slice, [FIRST, FIRST])
+    assert_right(one, FIRST, first)
+    assert not again
