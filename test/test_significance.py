@@ -117,14 +117,17 @@ class TestClutterArea:
     def test_box_around_few_spots_is_made_up_for(self) -> None:
         rng = np.random.default_rng(10)
         areas = [clutter_area_mm2(spots, np.arange(4), None) for spots in rng.uniform(0, 100, (4000, 12, 2))]
-        # The local density can only lower it.
-        assert 0.75 * 100**2 < np.mean(areas) < 1.05 * 100**2
+        # Where clutter happens to be dense around the four it is less; that is rare.
+        assert 0.9 * 100**2 < np.mean(areas) < 1.05 * 100**2
 
     def test_by_hand(self) -> None:
-        # Four at 10 mm around (50, 50), one unmatched among them, five far off: radius 15 mm, one unmatched nearby.
-        spots = np.array([[40, 50], [60, 50], [50, 40], [50, 60], [52, 51], *[[200 + i, 0] for i in range(5)]], float)
-        expected = 10 * (math.pi * 15**2 + 1e4 / 10) / 2
-        assert clutter_area_mm2(spots, np.arange(4), 1e4) == pytest.approx(expected)
+        # Four at 10 mm around (50, 50), six unmatched among them, five far off: radius 15 mm, six unmatched there where
+        # 11 * 707 / 10000 = 0.8 are expected.
+        among = [[52, 51], [48, 49], [51, 47], [53, 53], [47, 52], [49, 54]]
+        spots = np.array([[40, 50], [60, 50], [50, 40], [50, 60], *among, *[[200 + i, 0] for i in range(5)]], float)
+        assert clutter_area_mm2(spots, np.arange(4), 1e4) == pytest.approx(15 * math.pi * 15**2 / 6)
+        # One or two there are nothing unusual.
+        assert clutter_area_mm2(np.delete(spots, range(5, 10), axis=0), np.arange(4), 1e4) == 1e4
 
     def test_never_more_than_the_slice(self) -> None:
         spots = np.random.default_rng(11).uniform(0, 100, (8, 2))

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammainc
 
 from stereoreg_ros.geometry.pose import Array
 
@@ -26,6 +27,8 @@ _OPEN_POSITION = 10.0
 # Chi-square of a perfect fit, to rounding; exact data must not make the number of false alarms vanish.
 _LEAST_CHI_SQUARE = 1e-6
 _LEAST_AREA_MM2 = 100.0
+# Clutter around the frame that uniform clutter would bring less often than this is taken to be denser there.
+_CROWDED = 0.01
 _FEWEST, _SHARE_OF_FEWEST = 4, 0.01
 
 
@@ -71,8 +74,8 @@ def clutter_area_mm2(spots_mm: Array, matched: NDArray[np.intp], slice_area_mm2:
 
     matched: rows of the k spots given to rods. slice_area_mm2: where not known, spots uniform in a rectangle leave a
     margin of it empty, on average 1 / (s + 1) of each side: it is taken to be that much larger than the box around
-    them. Around the frame (half again as far as the matched spots reach) clutter can be denser than on average; that is
-    judged by the unmatched spots there, with one more over the area that one spot has on average, as few say little.
+    them. Around the frame (half again as far as the matched spots reach) clutter can be denser than elsewhere: where
+    there are more unmatched spots than uniform ones would be once in a hundred slices, their density is taken.
     """
     count = len(spots_mm)
     width, height = np.ptp(spots_mm, axis=0)
@@ -82,16 +85,21 @@ def clutter_area_mm2(spots_mm: Array, matched: NDArray[np.intp], slice_area_mm2:
     radius = 1.5 * float(np.linalg.norm(spots_mm[matched] - centre, axis=1).max())
     nearby = int((np.linalg.norm(spots_mm - centre, axis=1) <= radius).sum()) - len(matched)
     around = min(math.pi * radius**2, everywhere)
-    density = (nearby + 1) / (around + everywhere / count)
-    return min(everywhere, count / density)
+    expected = (count - len(matched)) * around / everywhere
+    # Probability of `nearby` or more by a Poisson law of that mean.
+    if nearby > 0 and gammainc(nearby, expected) < _CROWDED:
+        return min(everywhere, count * around / nearby)
+    return everywhere
 
 
 def share_of(inliers: int, lines: int) -> float:
     """Share of the allowed false alarms that matches of so many of the frame's rods get; all shares sum to one.
 
-    Five rods and every larger number get the same. Four have but one rod to confirm them and can hardly ever be told
-    from chance: they get a hundredth.
+    From five rods on each number gets half as much as the one below: the more rods, the less chance can bring, and the
+    less of the allowance is needed. Four rods have but one to confirm them and can hardly ever be told from chance:
+    they get a hundredth.
     """
     if inliers == _FEWEST:
         return 1.0 if lines == _FEWEST else _SHARE_OF_FEWEST
-    return (1.0 - _SHARE_OF_FEWEST) / (lines - _FEWEST)
+    total = sum(0.5**step for step in range(lines - _FEWEST))
+    return (1.0 - _SHARE_OF_FEWEST) * 0.5 ** (inliers - _FEWEST - 1) / total
