@@ -41,7 +41,7 @@ def register_slice(ct_slice: Slice, frame: Frame, options: RegistrationOptions |
     """Register `frame` from one slice: scanner_from_frame in mm, or a refusal with its reason."""
     options = options or RegistrationOptions()
     spots_px = find_spots(ct_slice, options)
-    return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice)
+    return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice, _area_mm2(ct_slice))
 
 
 def register_frames(
@@ -56,7 +56,9 @@ def register_frames(
     spots_px = find_spots(ct_slice, options)
     results: list[Registration | Refusal] = []
     for frame in frames:
-        result = register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice)
+        result = register_spots(
+            spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice, _area_mm2(ct_slice)
+        )
         if result:
             spots_px = np.delete(spots_px, [match.spot for match in result.matches], axis=0)
         results.append(result)
@@ -69,10 +71,12 @@ def register_spots(
     scale: PixelScale,
     options: RegistrationOptions | None = None,
     scanner_from_slice: Pose | None = None,
+    slice_area_mm2: float | None = None,
 ) -> Registration | Refusal:
     """Register `frame` from the centres of bright spots (n, 2) in pixel (u, v), false ones among them.
 
-    scanner_from_slice: where the slice lies in the scanner; by default the scanner is the slice.
+    scanner_from_slice: where the slice lies in the scanner; by default the scanner is the slice. slice_area_mm2: the
+    area over which spots could have been found; by default it is judged by the spots themselves.
     Raises ValueError where the spots are not of shape (n, 2) or not finite.
     """
     options = options or RegistrationOptions()
@@ -94,7 +98,7 @@ def register_spots(
     if count > MAX_SPOTS:
         return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
 
-    spots = _prepare(spots_px, scale, options.spot_noise_px)
+    spots = _prepare(spots_px, scale, options.spot_noise_px, slice_area_mm2)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     hypotheses = _MATCHERS[options.matcher](spots, frame, nominal, options)
     estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in hypotheses)
@@ -149,7 +153,11 @@ def register_spots(
     return Registration(frame, scale, options, spots_px, best, caution)
 
 
-def _prepare(spots_px: Array, scale: PixelScale, noise_px: float) -> Spots:
+def _area_mm2(ct_slice: Slice) -> float:
+    return ct_slice.hu.size * ct_slice.scale.sx * ct_slice.scale.sy
+
+
+def _prepare(spots_px: Array, scale: PixelScale, noise_px: float, slice_area_mm2: float | None) -> Spots:
     mm = scale.to_mm(spots_px)
     hull = cv2.convexHull(mm.astype(np.float32))
     return Spots(
@@ -157,7 +165,8 @@ def _prepare(spots_px: Array, scale: PixelScale, noise_px: float) -> Spots:
         whitening=scale.inverse_matrix / noise_px,
         sigma_mm=noise_px * max(scale.sx, scale.sy),
         variance_mm2=noise_px**2 * scale.sx * scale.sy,
-        area_mm2=max(float(cv2.contourArea(hull)), _LEAST_AREA_MM2),
+        hull_area_mm2=max(float(cv2.contourArea(hull)), _LEAST_AREA_MM2),
+        slice_area_mm2=slice_area_mm2,
     )
 
 

@@ -11,7 +11,7 @@ from frames import random_frame, random_slice_from_frame
 
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut, cut_jacobian
-from stereoreg_ros.matching.significance import clutter_area_mm2, log10_false_alarms
+from stereoreg_ros.matching.significance import clutter_area_mm2, log10_false_alarms, share_of
 
 
 class TestAgainstChance:
@@ -50,7 +50,7 @@ class TestAgainstChance:
             seed_information=seed_information - openness,
             spot_variance_mm2=self.SIGMA**2,
             area_mm2=self.SIDE**2,
-            sizes_tried=1,
+            share=1.0,
         )
         rng = np.random.default_rng(6)
         trials = 400_000
@@ -74,7 +74,7 @@ def stated(**changes: float) -> float:
         "chi_square": 5.0,
         "spot_variance_mm2": 0.02,
         "area_mm2": 40_000.0,
-        "sizes_tried": 3,
+        "share": 0.5,
     }
     information = np.diag([100.0, 100, 50, 1e5, 1e5, 1e5])
     return log10_false_alarms(**{**usual, **changes}, information=3 * information, seed_information=information)  # type: ignore[arg-type]
@@ -89,11 +89,11 @@ class TestBehaviour:
         assert stated(area_mm2=4e5) - stated() == pytest.approx(-3)
         assert stated(spot_variance_mm2=0.2) - stated() == pytest.approx(3)
         assert stated(choices_of_rods=10_000) - stated() == pytest.approx(2)
-        assert stated(sizes_tried=30) - stated() == pytest.approx(1)
+        assert stated(share=0.05) - stated() == pytest.approx(1)
         assert stated(spots=40) - stated() == pytest.approx(math.log10(37 * 36 * 35 / (17 * 16 * 15)))
 
     def test_a_chance_is_at_most_one(self) -> None:
-        hopeless = stated(chi_square=1e9, choices_of_rods=1, sizes_tried=1)
+        hopeless = stated(chi_square=1e9, choices_of_rods=1, share=1.0)
         assert hopeless == pytest.approx(math.log10(17 * 16 * 15))
 
     def test_exact_data_and_no_choices_stay_finite(self) -> None:
@@ -101,7 +101,7 @@ class TestBehaviour:
         assert stated(choices_of_rods=0) == stated(choices_of_rods=1)
 
     def test_a_seed_that_leaves_the_pose_open(self) -> None:
-        value = log10_false_alarms(4, 10, 5, 1.0, np.zeros((6, 6)), np.zeros((6, 6)), 0.02, 4e4, 1)
+        value = log10_false_alarms(4, 10, 5, 1.0, np.zeros((6, 6)), np.zeros((6, 6)), 0.02, 4e4, 1.0)
         assert math.isfinite(value)
 
 
@@ -109,23 +109,44 @@ class TestClutterArea:
     def test_uniform_clutter_has_its_own_area(self) -> None:
         rng = np.random.default_rng(7)
         spots = rng.uniform(0, 200, (4000, 2))
-        matched = np.flatnonzero(np.linalg.norm(spots - 100, axis=1) < 40)
-        assert clutter_area_mm2(spots, matched) == pytest.approx(200**2, rel=0.1)
+        # As the matched spots of a frame: some of those there, not all.
+        matched = np.flatnonzero(np.linalg.norm(spots - 100, axis=1) < 40)[::50]
+        assert clutter_area_mm2(spots, matched, None) == pytest.approx(200**2, rel=0.1)
+        assert clutter_area_mm2(spots, matched, 200.0**2) == pytest.approx(200**2, rel=0.1)
+
+    def test_box_around_few_spots_is_made_up_for(self) -> None:
+        rng = np.random.default_rng(10)
+        areas = [clutter_area_mm2(spots, np.arange(4), None) for spots in rng.uniform(0, 100, (4000, 12, 2))]
+        # Where clutter happens to be dense around the four it is less; that is rare.
+        assert 0.9 * 100**2 < np.mean(areas) < 1.05 * 100**2
 
     def test_by_hand(self) -> None:
-        # Four at 10 mm around (50, 50), one unmatched among them, five far off: radius 15 mm, five spots nearby.
-        spots = np.array([[40, 50], [60, 50], [50, 40], [50, 60], [52, 51], *[[200 + i, 0] for i in range(5)]], float)
-        assert clutter_area_mm2(spots, np.arange(4)) == pytest.approx(10 * math.pi * 15**2 / 3)
+        # Four at 10 mm around (50, 50), six unmatched among them, five far off: radius 15 mm, six unmatched there where
+        # 11 * 707 / 10000 = 0.8 are expected.
+        among = [[52, 51], [48, 49], [51, 47], [53, 53], [47, 52], [49, 54]]
+        spots = np.array([[40, 50], [60, 50], [50, 40], [50, 60], *among, *[[200 + i, 0] for i in range(5)]], float)
+        assert clutter_area_mm2(spots, np.arange(4), 1e4) == pytest.approx(15 * math.pi * 15**2 / 6)
+        # One or two there are nothing unusual.
+        assert clutter_area_mm2(np.delete(spots, range(5, 10), axis=0), np.arange(4), 1e4) == 1e4
+
+    def test_never_more_than_the_slice(self) -> None:
+        spots = np.random.default_rng(11).uniform(0, 100, (8, 2))
+        assert clutter_area_mm2(spots, np.arange(4), 3000.0) <= 3000.0
 
     def test_denser_clutter_nearby_shrinks_it(self) -> None:
         rng = np.random.default_rng(8)
         matched = np.array([[40, 50], [60, 50], [50, 40], [50, 60]], dtype=float)
         near, far = rng.uniform(42, 58, (20, 2)), rng.uniform(300, 400, (20, 2))
-        crowded = clutter_area_mm2(np.concatenate([matched, near]), np.arange(4))
-        sparse = clutter_area_mm2(np.concatenate([matched, far]), np.arange(4))
-        assert crowded == pytest.approx(sparse / 11)
+        crowded = clutter_area_mm2(np.concatenate([matched, near]), np.arange(4), 1e5)
+        sparse = clutter_area_mm2(np.concatenate([matched, far]), np.arange(4), 1e5)
+        assert crowded < 0.3 * sparse
 
     def test_does_not_depend_on_place_or_order(self) -> None:
         spots = np.random.default_rng(9).uniform(0, 200, (30, 2))
-        area = clutter_area_mm2(spots, np.array([3, 8, 11, 20]))
-        assert clutter_area_mm2(spots - 500, np.array([20, 3, 8, 11])) == pytest.approx(area)
+        area = clutter_area_mm2(spots, np.array([3, 8, 11, 20]), None)
+        assert clutter_area_mm2(spots - 500, np.array([20, 3, 8, 11]), None) == pytest.approx(area)
+
+
+@pytest.mark.parametrize("lines", [4, 5, 6, 7, 12])
+def test_shares_sum_to_one(lines: int) -> None:
+    assert sum(share_of(inliers, lines) for inliers in range(4, lines + 1)) == pytest.approx(1)

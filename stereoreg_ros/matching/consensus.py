@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from itertools import combinations
 from math import comb
 from typing import NamedTuple
@@ -16,8 +15,10 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut, cut_jacobian
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
-from stereoreg_ros.matching.significance import clutter_area_mm2, log10_false_alarms
+from stereoreg_ros.matching.significance import clutter_area_mm2, log10_false_alarms, share_of
 
+# Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
+GATE = 18.4
 # Height in chi-square of the ridge between two optima below which they are one valley; and its largest extent, rad.
 _RIDGE = 4.0
 _LARGEST_VALLEY = 0.5
@@ -29,19 +30,21 @@ class Spots(NamedTuple):
     """Spots as the matcher sees them.
 
     mm: (s, 2) in the slice; whitening: (2, 2) 1/mm, to unit variance; sigma_mm: the larger standard deviation of a
-    spot's centre along x or y; variance_mm2: product of both; area_mm2: over which spots lie.
+    spot's centre along x or y; variance_mm2: product of both; hull_area_mm2: over which spots lie; slice_area_mm2: over
+    which they could, None where not known.
     """
 
     mm: Array
     whitening: Array
     sigma_mm: float
     variance_mm2: float
-    area_mm2: float
+    hull_area_mm2: float
+    slice_area_mm2: float | None
 
 
 def score(hypothesis: Hypothesis, spots: Spots) -> float:
     """Log-likelihood of the matches over their being uniform clutter: what explanations are ranked by."""
-    gain = np.log(spots.area_mm2 / (2 * np.pi * spots.variance_mm2))
+    gain = np.log(spots.hull_area_mm2 / (2 * np.pi * spots.variance_mm2))
     return float(hypothesis.inliers * gain - hypothesis.chi_square / 2)
 
 
@@ -92,48 +95,40 @@ def _widened(hypothesis: Hypothesis, difference: Array, behind: float) -> Hypoth
 
 
 def judged(
-    found: list[Hypothesis], spots: Spots, frame: Frame, seeds_by_visible: NDArray[np.int64], sizes_tried: int
+    found: list[Hypothesis], spots: Spots, frame: Frame, seeds_by_visible: NDArray[np.int64]
 ) -> list[Hypothesis]:
     """Of distinct explanations, best first, those that the best one does not rule out, with their false alarms.
 
-    seeds_by_visible: at v, how many seeds were tried that have the slice cut v rods besides their own three;
-    sizes_tried: how many numbers of inliers would have been accepted.
+    seeds_by_visible: at v, how many seeds were found that have the slice cut v rods besides their own three.
     """
     return [
-        _with_significance(hypothesis, spots, frame, seeds_by_visible, sizes_tried)
+        _with_significance(hypothesis, spots, frame, seeds_by_visible)
         for hypothesis in found
         if score(found[0], spots) - score(hypothesis, spots) < TOLD_APART
     ]
 
 
 def _with_significance(
-    hypothesis: Hypothesis, spots: Spots, frame: Frame, seeds_by_visible: NDArray[np.int64], sizes_tried: int
+    hypothesis: Hypothesis, spots: Spots, frame: Frame, seeds_by_visible: NDArray[np.int64]
 ) -> Hypothesis:
     used = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
     cuts = cut(frame, hypothesis.rotation[None], hypothesis.translation[None])
     jacobian = (spots.whitening @ cut_jacobian(cuts, hypothesis.translation[None]))[0]
-    by_line = np.einsum("nki,nkj->nij", jacobian, jacobian)
+    by_line = np.swapaxes(jacobian, 1, 2) @ jacobian
     # Any three of the rods could have been the seed; the one that fixes the pose best predicts the sharpest.
-    best = max(
-        (by_line[list(t)].sum(axis=0) for t in _triples(tuple(used))),
-        key=lambda information: float(np.linalg.slogdet(information)[1]),
-    )
+    triples = np.array(list(combinations(used, 3)))
+    seeds = by_line[triples].sum(axis=1)
+    best = seeds[np.argmax(np.linalg.slogdet(seeds)[1])]
+    choices = (int(seeds) * comb(visible, len(used) - 3) for visible, seeds in enumerate(seeds_by_visible))
     value = log10_false_alarms(
         inliers=len(used),
         spots=len(spots.mm),
-        choices_of_rods=sum(
-            int(seeds) * comb(visible, len(used) - 3) for visible, seeds in enumerate(seeds_by_visible)
-        ),
+        choices_of_rods=sum(choices),
         chi_square=hypothesis.chi_square,
         information=by_line[used].sum(axis=0),
         seed_information=best,
         spot_variance_mm2=spots.variance_mm2,
-        area_mm2=clutter_area_mm2(spots.mm, hypothesis.spot_of_line[used]),
-        sizes_tried=sizes_tried,
+        area_mm2=clutter_area_mm2(spots.mm, hypothesis.spot_of_line[used], spots.slice_area_mm2),
+        share=share_of(len(used), len(frame)),
     )
     return replace(hypothesis, log10_false_alarms=value)
-
-
-@lru_cache(maxsize=1024)
-def _triples(lines: tuple[int, ...]) -> tuple[tuple[int, int, int], ...]:
-    return tuple(combinations(lines, 3))

@@ -127,7 +127,8 @@ def match(
         spots.whitening,
     )
     angle = rotation_angle(refined.rotations @ nominal_slice_from_frame.T)
-    kept = refined.converged & (angle <= np.radians(options.max_rotation_deg))
+    max_rotation = float(np.radians(options.max_rotation_deg))
+    kept = refined.converged & (angle <= max_rotation)
     found = [
         Hypothesis(
             refined.rotations[i],
@@ -142,8 +143,7 @@ def match(
     # Every sample drawn is a pose that was tried, with any choice of the further rods.
     tried = np.zeros(len(frame) - 2, dtype=np.int64)
     tried[-1] = result.samples
-    sizes_tried = max(len(frame) - options.min_inliers + 1, 1)
-    return judged(distinct(found, spots), spots, frame, tried, sizes_tried)
+    return judged(distinct(found, spots), spots, frame, tried)
 
 
 def _has_collinear_triple(four: Array, smallest_sine: float) -> bool:

@@ -21,6 +21,9 @@ from stereoreg_ros.geometry.pose import Array
 PAIRS = ((0, 1), (0, 2), (1, 2))
 _CELLS_PER_ROD = 10
 _STEPS = 6
+_STEPS_BEFORE_SORTING_OUT = 1
+# Bins of the table along each of the three distances.
+_BINS = 25
 # Damping of the steps, in units of squared cosines: reached only where a double root is near.
 _DAMPING = 1e-5
 
@@ -38,7 +41,7 @@ class Seeds(NamedTuple):
     lambdas: Array
     lambda_covariance: Array
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Seeds:
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Seeds:
         """Only the given seeds."""
         return Seeds(
             self.triples[rows],
@@ -65,6 +68,18 @@ class ThreeLineSolver:
         low, high = frame.lambda_min[rows] - end_slack_mm, frame.lambda_max[rows] + end_slack_mm
         self.lambda_low, self.lambda_high = low, high
         self._cell = (high - low) / _CELLS_PER_ROD
+        # d^2 = la^2 + lb^2 - 2 cosine la lb + 2 at_a la + 2 at_b lb + constant, for each pair of rods.
+        self._quadratics = []
+        for a, b in PAIRS:
+            between = self._origins[a] - self._origins[b]
+            self._quadratics.append(
+                (
+                    float(self._directions[a] @ self._directions[b]),
+                    float(self._directions[a] @ between),
+                    float(-self._directions[b] @ between),
+                    float(between @ between),
+                )
+            )
         steps = (np.arange(_CELLS_PER_ROD) + 0.5) / _CELLS_PER_ROD
         axes = [low[i] + (high - low)[i] * steps for i in range(3)]
         self._centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -107,11 +122,10 @@ class ThreeLineSolver:
     def _fill_table(self) -> None:
         """Bins over the three distances, each with the cells that can have them."""
         span = self.distance_high - self.distance_low
-        self._bin = np.maximum(span / 24, 1e-6)
-        self._shape = np.full(3, 25)
+        self._bin = np.maximum(span / (_BINS - 1), 1e-6)
         first = ((self._nearest - self.tolerance_mm - self.distance_low) / self._bin).astype(np.intp)
         last = ((self._farthest + self.tolerance_mm - self.distance_low) / self._bin).astype(np.intp)
-        first, last = np.clip(first, 0, 24), np.clip(last, 0, 24)
+        first, last = np.clip(first, 0, _BINS - 1), np.clip(last, 0, _BINS - 1)
         extent = last - first + 1
         count = extent.prod(axis=1)
         cell = np.repeat(np.arange(len(count)), count)
@@ -122,98 +136,138 @@ class ThreeLineSolver:
         flat = self._flat(first[cell] + np.stack([x, y, z], axis=1))
         order = np.argsort(flat, kind="stable")
         self._table = cell[order]
-        self._table_start = np.searchsorted(flat[order], np.arange(self._shape.prod() + 1))
+        self._table_start = np.searchsorted(flat[order], np.arange(_BINS**3 + 1))
 
     def _flat(self, bins: NDArray[np.intp]) -> NDArray[np.intp]:
-        flat: NDArray[np.intp] = (bins[:, 0] * self._shape[1] + bins[:, 1]) * self._shape[2] + bins[:, 2]
+        flat: NDArray[np.intp] = (bins[:, 0] * _BINS + bins[:, 1]) * _BINS + bins[:, 2]
         return flat
 
     def solve(self, spots_mm: Array) -> Seeds:
         """Poses for triples of spots (t, 3, 2) mm in the slice; the spots in the order of the rods."""
         sides = np.stack([spots_mm[:, a] - spots_mm[:, b] for a, b in PAIRS], axis=1)
-        distances = np.linalg.norm(sides, axis=-1)
+        distances = np.sqrt((sides**2).sum(axis=-1))
+        triple, cell = self._candidates(distances)
+        known = [np.ascontiguousarray(distances[triple, pair]) for pair in range(3)]
+        start = [np.ascontiguousarray(self._centres[cell, rod]) for rod in range(3)]
+        lambdas = list(start)
+        for number in range(_STEPS):
+            equations = self._equations(lambdas, known)
+            steps = _damped_step(equations)
+            lambdas = [
+                value - np.minimum(np.maximum(step, -size), size)
+                for value, step, size in zip(lambdas, steps, self._cell, strict=True)
+            ]
+            if number == _STEPS_BEFORE_SORTING_OUT:
+                # A start that leads away leads to another cell's solution, or to none.
+                near = self._is_near(lambdas, start, 2.0)
+                triple = triple[near]
+                known, start, lambdas = ([part[near] for part in parts] for parts in (known, start, lambdas))
+        equations = self._equations(lambdas, known)
+        misfit = np.abs(equations.error[0])
+        for error in equations.error[1:]:
+            np.maximum(misfit, np.abs(error), out=misfit)
+        found = (misfit <= self.tolerance_mm) & self._is_near(lambdas, start, 1.25)
+        for value, low, high in zip(lambdas, self.lambda_low, self.lambda_high, strict=True):
+            found &= (value >= low) & (value <= high)
+        rows = np.flatnonzero(found)
+        # Of step ends in one place the best is kept, which is found first when they are sorted by their misfit.
+        rows = rows[np.argsort(misfit[rows], kind="stable")]
+        key = triple[rows].astype(np.int64)
+        for value, size in zip(lambdas, self._cell, strict=True):
+            key = key * 4096 + np.round(value[rows] / (0.1 * size)).astype(np.int64) % 4096
+        _, first = np.unique(key, return_index=True)
+        kept = rows[np.sort(first)]
+        kept = kept[np.argsort(triple[kept], kind="stable")]
+        triple = triple[kept]
+        ends = np.column_stack([value[kept] for value in lambdas])
+        rotations, translations = _pose(self._points(ends), spots_mm[triple])
+        covariance = self._covariance(equations.take(kept), distances[triple])
+        return Seeds(triple, rotations, translations, ends, covariance)
+
+    def _candidates(self, distances: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of triples and of the cells that their distances (t, 3) allow."""
         possible = ((distances >= self.distance_low) & (distances <= self.distance_high)).all(axis=1)
         rows = np.flatnonzero(possible)
         bins = ((distances[rows] - self.distance_low) / self._bin).astype(np.intp)
-        flat = self._flat(np.clip(bins, 0, 24))
+        flat = self._flat(np.minimum(bins, _BINS - 1))
         start, stop = self._table_start[flat], self._table_start[flat + 1]
         count = stop - start
         triple = np.repeat(rows, count)
-        position = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(start, count)
-        cell = self._table[position]
-        near = distances[triple]
-        fits = (near >= self._nearest[cell] - self.tolerance_mm).all(axis=1)
-        fits &= (near <= self._farthest[cell] + self.tolerance_mm).all(axis=1)
-        triple, cell, near = triple[fits], cell[fits], near[fits]
-        lambdas = self._centres[cell]
-        for _ in range(_STEPS):
-            error, jacobian = self._equations(lambdas, near)
-            step = _damped_step(jacobian, error)
-            lambdas = lambdas - np.clip(step, -self._cell, self._cell)
-        error, jacobian = self._equations(lambdas, near)
-        found = (np.abs(error) <= self.tolerance_mm).all(axis=1)
-        # A solution far from the cell it was sought in is another cell's.
-        found &= (np.abs(lambdas - self._centres[cell]) <= self._cell).all(axis=1)
-        found &= ((lambdas >= self.lambda_low) & (lambdas <= self.lambda_high)).all(axis=1)
-        # Of the steps' ends that are close together, the one that fits best is the solution's.
-        rows = np.flatnonzero(found)
-        rows = rows[np.argsort(np.abs(error[rows]).max(axis=1), kind="stable")]
-        rounded = np.round(lambdas[rows] / (0.1 * self._cell)).astype(np.int64)
-        _, first = np.unique(np.column_stack([triple[rows], rounded]), axis=0, return_index=True)
-        kept = np.sort(rows[first])
-        triple, lambdas, jacobian = triple[kept], lambdas[kept], jacobian[kept]
-        rotations, translations = _pose(self._points(lambdas), spots_mm[triple])
-        return Seeds(triple, rotations, translations, lambdas, self._covariance(jacobian, distances[triple]))
+        cell = self._table[np.arange(len(triple)) + np.repeat(start - (np.cumsum(count) - count), count)]
+        fits = np.ones(len(triple), dtype=bool)
+        for pair in range(3):
+            known = distances[triple, pair]
+            fits &= known >= self._nearest[cell, pair] - self.tolerance_mm
+            fits &= known <= self._farthest[cell, pair] + self.tolerance_mm
+        return triple[fits], cell[fits]
 
-    def _equations(self, lambdas: Array, distances: Array) -> tuple[Array, Array]:
-        """Errors of the three distances (m, 3) mm and their derivatives (m, 3, 3) by the positions.
+    def _is_near(self, lambdas: list[Array], start: list[Array], cells: float) -> NDArray[np.bool_]:
+        near = np.ones(len(lambdas[0]), dtype=bool)
+        for value, first, size in zip(lambdas, start, self._cell, strict=True):
+            near &= np.abs(value - first) <= cells * size
+        return near
 
-        (d^2 - D^2) / 2D is the distance's error to first order, and smooth where rods meet.
+    def _equations(self, lambdas: list[Array], distances: list[Array]) -> _Equations:
+        """(d^2 - D^2) / 2D for each pair: the distance's error to first order, and smooth where rods meet.
+
+        d^2 is quadratic in the two positions; its coefficients are those of `_quadratics`.
         """
-        points = self._points(lambdas)
-        error = np.empty_like(lambdas)
-        jacobian = np.zeros((len(lambdas), 3, 3))
-        for row, (a, b) in enumerate(PAIRS):
-            difference = points[:, a] - points[:, b]
-            known = distances[:, row]
-            error[:, row] = (np.einsum("mi,mi->m", difference, difference) - known**2) / (2 * known)
-            jacobian[:, row, a] = difference @ self._directions[a] / known
-            jacobian[:, row, b] = -difference @ self._directions[b] / known
-        return error, jacobian
+        errors, slopes = [], []
+        for (a, b), (cosine, at_a, at_b, constant), known in zip(PAIRS, self._quadratics, distances, strict=True):
+            first, second = lambdas[a], lambdas[b]
+            slope_a = first - cosine * second + at_a
+            slope_b = second - cosine * first + at_b
+            squared = first * (slope_a + at_a) + second * (slope_b + at_b) + constant
+            inverse = 1.0 / known
+            errors.append(0.5 * (squared * inverse - known))
+            slopes.append((slope_a * inverse, slope_b * inverse))
+        return _Equations(errors, slopes)
 
-    def _covariance(self, jacobian: Array, distances: Array) -> Array:
+    def _covariance(self, equations: _Equations, distances: Array) -> Array:
         """Covariance (m, 3, 3) mm^2 of the positions, for distances known to a quarter of the tolerance.
 
         At a double root the distance changes only with the square of the position, x^2 / 2D: there a position is known
         to sqrt(2 D sigma), not to infinity.
         """
         sigma = self.tolerance_mm / 4
-        curved = 2 * distances.max(axis=1) * sigma
-        information = np.swapaxes(jacobian, 1, 2) @ jacobian / sigma**2
-        np.einsum("mii->mi", information)[:] += 1 / curved[:, None]
-        return np.asarray(np.linalg.inv(information), dtype=np.float64)
+        damping = sigma / (2 * distances.max(axis=1))
+        inverse, determinant = _inverse_normal(equations, damping)
+        xx, yy, zz, xy, xz, yz = (part * (sigma**2 / determinant) for part in inverse)
+        return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
 
 
-def _damped_step(jacobian: Array, error: Array) -> Array:
-    """(J'J + mu)^-1 J' e for many 3x3 J, by the adjugate: a tenth of the time of LAPACK's call for each."""
-    a = np.einsum("mki,mkj->mij", jacobian, jacobian)
-    mu = _DAMPING
-    xx, yy, zz = a[:, 0, 0] + mu, a[:, 1, 1] + mu, a[:, 2, 2] + mu
-    xy, xz, yz = a[:, 0, 1], a[:, 0, 2], a[:, 1, 2]
-    right = np.einsum("mki,mk->mi", jacobian, error)
-    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    cyy, cyz, czz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    determinant = xx * cxx + xy * cxy + xz * cxz
-    step = np.stack(
-        [
-            cxx * right[:, 0] + cxy * right[:, 1] + cxz * right[:, 2],
-            cxy * right[:, 0] + cyy * right[:, 1] + cyz * right[:, 2],
-            cxz * right[:, 0] + cyz * right[:, 1] + czz * right[:, 2],
-        ],
-        axis=1,
+class _Equations(NamedTuple):
+    """Errors of the three distances, and the derivatives of each by the positions on its two rods."""
+
+    error: list[Array]
+    slope: list[tuple[Array, Array]]
+
+    def take(self, rows: NDArray[np.intp]) -> _Equations:
+        return _Equations([part[rows] for part in self.error], [(a[rows], b[rows]) for a, b in self.slope])
+
+
+def _inverse_normal(equations: _Equations, damping: Array | float) -> tuple[tuple[Array, ...], Array]:
+    """Adjugate (xx, yy, zz, xy, xz, yz) and determinant of J'J + damping, in elements: LAPACK takes far longer."""
+    (a0, b0), (a1, c1), (b2, c2) = equations.slope
+    xx, yy, zz = a0 * a0 + a1 * a1 + damping, b0 * b0 + b2 * b2 + damping, c1 * c1 + c2 * c2 + damping
+    xy, xz, yz = a0 * b0, a1 * c1, b2 * c2
+    cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    cxy, cxz, cyz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+    return (cxx, cyy, czz, cxy, cxz, cyz), xx * cxx + xy * cxy + xz * cxz
+
+
+def _damped_step(equations: _Equations) -> tuple[Array, Array, Array]:
+    """(J'J + mu)^-1 J' e."""
+    (a0, b0), (a1, c1), (b2, c2) = equations.slope
+    e0, e1, e2 = equations.error
+    (cxx, cyy, czz, cxy, cxz, cyz), determinant = _inverse_normal(equations, _DAMPING)
+    right_x, right_y, right_z = a0 * e0 + a1 * e1, b0 * e0 + b2 * e2, c1 * e1 + c2 * e2
+    inverse = 1.0 / determinant
+    return (
+        (cxx * right_x + cxy * right_y + cxz * right_z) * inverse,
+        (cxy * right_x + cyy * right_y + cyz * right_z) * inverse,
+        (cxz * right_x + cyz * right_y + czz * right_z) * inverse,
     )
-    result: Array = step / determinant[:, None]
-    return result
 
 
 def _pose(points: Array, spots_mm: Array) -> tuple[Array, Array]:
