@@ -21,9 +21,9 @@ def _frame(name: str, ends_mm: ArrayLike) -> Frame:
 
 
 # Between the lower and the upper face of a cube of 60 mm, the lower one at z = 0, since the paper's slices lie at
-# z = 30 +- 10. Figures with n lines use the first n. a to d are diagonals of the side faces; e to h were drawn at
-# random over whole mm until the closed forms did about as well as in the paper: with many a layout, eight diagonals of
-# side faces for one, they do several times worse, while Newton-Raphson and maximum likelihood do not.
+# z = 30 +- 10. Figures with n lines use the first n. Selected, as the report tells: a to d by a search for a small
+# Cramer-Rao bound; e to h among random ones for a small bound, Newton-Raphson below the paper's figures and closed
+# forms near them. The layouts drawn without selection did worse.
 EIGHT_RODS: Final = _frame(
     "eight rods",
     [
