@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from contract import DIAGNOSTIC_KEYS
 from dicom_files import CATPHAN, ROOT, SHARED_DATA, real, write_slice
 
 from stereoreg_ros import cli, load_frame
@@ -26,25 +27,6 @@ from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Refusal
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, render_slice
 
-DIAGNOSTIC_KEYS = [
-    "outcome",
-    "reason",
-    "frame",
-    "spots",
-    "lines",
-    "inliers",
-    "residual_rms_mm",
-    "residual_rms_px",
-    "log10_false_alarms",
-    "ambiguous_poses",
-    "position_std_mm",
-    "rotation_std_deg",
-    "target_error_95_mm",
-    "pixel_spacing_x_mm",
-    "pixel_spacing_y_mm",
-    "calibration",
-    "duration_ms",
-]
 SCALE = PixelScale(0.4, 0.45)
 SLICE_FROM_FRAME = Pose(rotation_exp(np.array([0.12, -0.08, 0.3])), np.array([42.0, 48.0, 3.0]))
 # Where write_slice puts the slice unless told otherwise.

@@ -15,6 +15,7 @@ import pytest
 import rclpy
 import yaml
 from builtin_interfaces.msg import Time
+from contract import DIAGNOSTIC_KEYS
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -37,26 +38,7 @@ NODE = "/register_node"
 SCALE = PixelScale(0.5, 0.6)
 SCANNER = ScannerSettings(shape=(256, 256), scale=SCALE)
 CUBE = load_frame("cube6")
-KEYS = [
-    "outcome",
-    "reason",
-    "frame",
-    "spots",
-    "lines",
-    "inliers",
-    "residual_rms_mm",
-    "residual_rms_px",
-    "log10_false_alarms",
-    "ambiguous_poses",
-    "position_std_mm",
-    "rotation_std_deg",
-    "target_error_95_mm",
-    "pixel_spacing_x_mm",
-    "pixel_spacing_y_mm",
-    "calibration",
-    "duration_ms",
-]
-NUMBERS = set(KEYS) - {"outcome", "reason", "frame", "calibration"}
+NUMBERS = set(DIAGNOSTIC_KEYS) - {"outcome", "reason", "frame", "calibration"}
 START = {entry.name: entry.value for entry in ENTRIES} | {"pixel_spacing": [SCALE.sx, SCALE.sy]}
 
 
@@ -112,7 +94,7 @@ class Bench:
         array = self.client.wait_for(lambda: of_stamp(self.diagnostics, stamp), "the diagnostics of an image")
         (status,) = array.status
         assert status.name == "register_node: registration"
-        assert [pair.key for pair in status.values] == KEYS
+        assert [pair.key for pair in status.values] == DIAGNOSTIC_KEYS
         for pair in status.values:
             if pair.key in NUMBERS:
                 float(pair.value)

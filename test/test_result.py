@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from contract import DIAGNOSTIC_KEYS
 
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
@@ -15,25 +16,6 @@ from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import REASONS, Match, PoseEstimate, Refusal, Registration, diagnostics
 from stereoreg_ros.uncertainty import error_ball_95
 
-KEYS = [
-    "outcome",
-    "reason",
-    "frame",
-    "spots",
-    "lines",
-    "inliers",
-    "residual_rms_mm",
-    "residual_rms_px",
-    "log10_false_alarms",
-    "ambiguous_poses",
-    "position_std_mm",
-    "rotation_std_deg",
-    "target_error_95_mm",
-    "pixel_spacing_x_mm",
-    "pixel_spacing_y_mm",
-    "calibration",
-    "duration_ms",
-]
 CONTRACT_REASONS = {"too_few_spots", "no_consensus", "ambiguous", "degenerate", "inaccurate", "bad_image"}
 
 FRAME = load_frame("cube6")
@@ -100,7 +82,7 @@ class TestFigures:
 class TestDiagnostics:
     def test_keys_are_those_of_the_contract_in_its_order(self, accepted: Registration) -> None:
         for result in (accepted, refused(), refused((estimate(), estimate()))):
-            assert list(diagnostics(result, "configured", 0.1)) == KEYS
+            assert list(diagnostics(result, "configured", 0.1)) == DIAGNOSTIC_KEYS
 
     def test_of_an_accepted_slice(self, accepted: Registration) -> None:
         told = diagnostics(accepted, "measured", 0.0125)
