@@ -286,7 +286,8 @@ class TestClosedForms:
             # Of the normalised unknowns, in which the pivot is chosen.
             system = linear_system(frame, np.arange(n), SCALE.to_mm(spots), POSE_RANK)
             along = np.linalg.svd(system.matrix)[2][8, 6:]
-            turn = Rotation.align_vectors([[1.0, 0.0, 0.0]], [along / np.linalg.norm(along)])[0].as_matrix()
+            turn = np.linalg.svd(along[None])[2]  # its first row lies along the open direction: that becomes x
+            turn[2] *= np.linalg.det(turn)
             turned = Frame("turned", frame.line_names, frame.starts @ turn.T, frame.ends @ turn.T, frame.diameters)
             true = pose @ Pose(turn.T, np.zeros(3))
             system = linear_system(turned, np.arange(n), SCALE.to_mm(spots), POSE_RANK)
