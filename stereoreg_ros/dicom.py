@@ -402,7 +402,7 @@ def _pydicom(file: Path, problem: str) -> Iterator[None]:
         warnings.simplefilter("ignore")
         try:
             yield
-        # It raises nearly anything then, struct.error, AttributeError and NotImplementedError among it.
+        # It raises nearly anything then, struct.error and AttributeError among it.
         except Exception as error:
             cause = " ".join(str(error).split()) or type(error).__name__
             raise DicomError(file, f"{problem}: {cause}") from error

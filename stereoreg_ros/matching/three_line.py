@@ -34,8 +34,10 @@ def match(
 
     nominal_slice_from_frame: (3, 3), how the frame roughly stands in the slice.
     Explanations of all rods are sought first, then of all but one, and so on. At each level every set of so many rods
-    holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots; so once
-    one is found, nothing with more rods can be left, and what has fewer is ruled out by it.
+    holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots. Once an
+    explanation of so many rods is found, those of fewer are not sought: a rod more is worth more than any residual that
+    passes the gates but a bad one. Complete but for the seeds: of a well-conditioned triple 99.5 % of the poses are
+    found, not all, which other triples mostly make up for.
     """
     found: list[Hypothesis] = []
     order = triple_order(frame, options.min_inliers)
