@@ -12,25 +12,27 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 
 _ORTHONORMAL_TOLERANCE = 1e-6
+# [v]x, row by row, is v @ _SKEW.
+_SKEW = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], dtype=float
+)
 
 
 def skew(vectors: Array) -> Array:
     """Cross-product matrices [v]x of vectors (..., 3), so that skew(v) @ p = v x p; shape (..., 3, 3)."""
-    matrices = np.zeros((*vectors.shape, 3))
-    matrices[..., 0, 1], matrices[..., 0, 2] = -vectors[..., 2], vectors[..., 1]
-    matrices[..., 1, 0], matrices[..., 1, 2] = vectors[..., 2], -vectors[..., 0]
-    matrices[..., 2, 0], matrices[..., 2, 1] = -vectors[..., 1], vectors[..., 0]
-    return matrices
+    matrices: Array = vectors @ _SKEW
+    return matrices.reshape(*vectors.shape, 3)
 
 
 def rotation_exp(rotation_vectors: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues' formula)."""
-    angle = np.linalg.norm(rotation_vectors, axis=-1)[..., None, None]
-    cross = skew(rotation_vectors)
-    # sinc forms are exact at and near zero, where dividing by the angle is not.
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    rotations: Array = np.eye(3) + first * cross + second * (cross @ cross)
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians, by their quaternions."""
+    squared = np.einsum("...i,...i->...", rotation_vectors, rotation_vectors)[..., None, None]
+    half = 0.5 * np.sqrt(squared)
+    # The sinc form is exact at and near zero, where dividing by the angle is not.
+    scaled = 0.5 * np.sinc(half[..., 0] / np.pi) * rotation_vectors  # vector part of the quaternion
+    rotations: Array = 2.0 * scaled[..., :, None] * scaled[..., None, :]
+    rotations += 2.0 * np.cos(half) * skew(scaled)
+    np.einsum("...ii->...i", rotations)[...] += np.cos(2.0 * half[..., 0])
     return rotations
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, Pose, skew
+from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale
 
 # Below this cosine between rod and slice normal the cut runs away along the rod: treated as no cut at all.
@@ -38,8 +38,9 @@ def cut(frame: Frame, rotations: Array, translations: Array) -> Cuts:
 
     This is eq. 28 of Maurin 2009: its least-squares form reduces to the line's intersection with the plane z = 0.
     """
-    directions = frame.directions @ np.swapaxes(rotations, -1, -2)
-    origins = frame.origins @ np.swapaxes(rotations, -1, -2) + translations[..., None, :]
+    frame_from_slice = np.swapaxes(rotations, -1, -2)
+    directions = frame.directions @ frame_from_slice
+    origins = frame.origins @ frame_from_slice + translations[..., None, :]
     cosine = directions[..., 2]
     crosses = np.abs(cosine) > _MIN_COSINE
     lambdas = np.where(crosses, -origins[..., 2] / np.where(crosses, cosine, 1.0), np.nan)
@@ -56,15 +57,19 @@ def cut_jacobian(cuts: Cuts, translations: Array) -> Array:
     NaN where a line runs within the slice.
     """
     cosine = np.where(np.isnan(cuts.lambdas), np.nan, cuts.directions[..., 2])
-    slope = cuts.directions[..., :2] / cosine[..., None]
-    # A point of the rod that moves by dp moves the cut by dp_xy - slope dp_z: the rod slides through the plane.
-    slide = np.zeros((*slope.shape, 3))
-    slide[..., 0, 0] = slide[..., 1, 1] = 1.0
-    slide[..., :, 2] = -slope
-    arm = np.zeros((*slope.shape[:-1], 3))
-    arm[..., :2] = cuts.points_mm
-    arm -= translations[..., None, :]
-    return np.concatenate([slide, -slide @ skew(arm)], axis=-1)
+    # A point of the rod that moves by dp moves the cut by dp_xy - slope dp_z: the rod slides through the plane. Turned
+    # by w about the frame's origin, the point moves by w x arm.
+    slope_x, slope_y = cuts.directions[..., 0] / cosine, cuts.directions[..., 1] / cosine
+    arm_x = cuts.points_mm[..., 0] - translations[..., None, 0]
+    arm_y = cuts.points_mm[..., 1] - translations[..., None, 1]
+    arm_z = -translations[..., None, 2]
+    jacobian: Array = np.zeros((*slope_x.shape, 2, 6))
+    jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0
+    jacobian[..., 0, 2], jacobian[..., 1, 2] = -slope_x, -slope_y
+    jacobian[..., 0, 3], jacobian[..., 1, 3] = -slope_x * arm_y, -slope_y * arm_y - arm_z
+    jacobian[..., 0, 4], jacobian[..., 1, 4] = slope_x * arm_x + arm_z, slope_y * arm_x
+    jacobian[..., 0, 5], jacobian[..., 1, 5] = -arm_y, arm_x
+    return jacobian
 
 
 def project(frame: Frame, slice_from_frame: Pose, scale: PixelScale) -> tuple[Array, Cuts]:

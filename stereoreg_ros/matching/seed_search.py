@@ -28,16 +28,18 @@ _PIECE = 2_000_000
 class Starts(NamedTuple):
     """Where to start refining, m of them.
 
-    rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame; spot_of_line (m, n), UNMATCHED where none.
+    rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame; spot_of_line (m, n), UNMATCHED where none; origin
+    (m,): the same number for starts from the same seed.
     """
 
     rotations: Array
     translations: Array
     spot_of_line: NDArray[np.intp]
+    origin: NDArray[np.intp]
 
     def take(self, rows: slice) -> Starts:
         """Only the given ones."""
-        return Starts(self.rotations[rows], self.translations[rows], self.spot_of_line[rows])
+        return Starts(self.rotations[rows], self.translations[rows], self.spot_of_line[rows], self.origin[rows])
 
 
 class SeedSearch(NamedTuple):
@@ -80,7 +82,7 @@ class SeedSearch(NamedTuple):
         more = (full != UNMATCHED).sum(axis=1) > 4
         rows = np.concatenate([seed, seed[more]])
         return Starts(
-            self.seeds.rotations[rows], self.seeds.translations[rows], np.concatenate([spot_of_line, full[more]])
+            self.seeds.rotations[rows], self.seeds.translations[rows], np.concatenate([spot_of_line, full[more]]), rows
         )
 
 

@@ -15,45 +15,55 @@ from stereoreg_ros.matching.significance import LEAST_COSINE
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
 _ROUNDS = 4
+# Steps of a first refinement: most starts that lead anywhere are at rest by then.
+_FIRST_STEPS, _STEPS = 8, 30
 # Variance of a prediction, in units of a spot's, beyond which it says nothing about where the spot should be.
 _VAGUE = 1e6
 
 
 def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[Hypothesis]:
     """Refine, match all rods to the spots they predict, and repeat until the matches no longer change."""
-    rotations, translations, spot_of_line = start.rotations, start.translations, start.spot_of_line
-    refined = _refine(spots, frame, rotations, translations, spot_of_line, iterations=6)
-    for _ in range(_ROUNDS):
+    settled: list[Hypothesis] = []
+    spot_of_line, origin = start.spot_of_line, start.origin
+    refined = _refine(spots, frame, start.rotations, start.translations, spot_of_line, _FIRST_STEPS)
+    for number in range(_ROUNDS):
         assigned = _assign(spots, frame, refined)
         enough = (assigned != UNMATCHED).sum(axis=1) >= min_inliers
-        # The same matches from many seeds: one start is enough for each place the pose can be.
-        place = np.round(np.column_stack([10 * refined.rotations.reshape(-1, 9), refined.translations / 5]))
-        rows = np.flatnonzero(enough)
-        _, first = np.unique(np.column_stack([assigned[rows], place[rows]]), axis=0, return_index=True)
-        rows = rows[first]
-        rotations, translations, assigned = refined.rotations[rows], refined.translations[rows], assigned[rows]
-        refined = _refine(spots, frame, rotations, translations, assigned, iterations=30)
-        if not len(rows) or (_assign(spots, frame, refined) == assigned).all():
-            break
-    stable = (_assign(spots, frame, refined) == assigned).all(axis=1)
-    return [
-        Hypothesis(
-            refined.rotations[i],
-            refined.translations[i],
-            assigned[i],
-            float(refined.chi_square[i]),
-            refined.information[i],
-            np.nan,
+        same = (assigned == spot_of_line).all(axis=1)
+        at_rest = same & (refined.converged | (number > 0))
+        settled += [
+            Hypothesis(
+                refined.rotations[i],
+                refined.translations[i],
+                assigned[i],
+                float(refined.chi_square[i]),
+                refined.information[i],
+                np.nan,
+            )
+            for i in np.flatnonzero(enough & at_rest)
+        ]
+        # What another start from the same seed has come to is not sought again.
+        known = {(origin[i], assigned[i].tobytes()) for i in np.flatnonzero(at_rest)}
+        rows = np.array(
+            [i for i in np.flatnonzero(enough & ~at_rest) if (origin[i], assigned[i].tobytes()) not in known],
+            dtype=np.intp,
         )
-        for i in np.flatnonzero(stable)
-    ]
+        if not rows.size:
+            break
+        if rows.size > 1:
+            # The same matches from many seeds: one start is enough for each place the pose can be.
+            place = np.column_stack([10 * refined.rotations[rows].reshape(-1, 9), refined.translations[rows] / 5])
+            rows = rows[np.unique(np.column_stack([assigned[rows], np.round(place)]), axis=0, return_index=True)[1]]
+        spot_of_line, origin = assigned[rows], origin[rows]
+        refined = _refine(spots, frame, refined.rotations[rows], refined.translations[rows], spot_of_line, _STEPS)
+    return settled
 
 
 def _refine(
-    spots: Spots, frame: Frame, rotations: Array, translations: Array, spot_of_line: NDArray[np.intp], iterations: int
+    spots: Spots, frame: Frame, rotations: Array, translations: Array, spot_of_line: NDArray[np.intp], steps: int
 ) -> Refined:
     used = spot_of_line != UNMATCHED
-    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, spots.whitening, iterations)
+    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, spots.whitening, steps)
 
 
 def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
@@ -79,10 +89,12 @@ def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
     least = np.take_along_axis(squared, nearest[..., None], axis=2)[..., 0]
     assigned = np.where(least <= GATE, nearest, UNMATCHED)
     # Where two rods want one spot, the nearer has it.
-    for line in range(len(frame)):
-        rival = (assigned == assigned[:, line : line + 1]) & (assigned != UNMATCHED)
-        rival[:, line] = False
-        loses = (rival & (least < least[:, line : line + 1])).any(axis=1)
-        loses |= (rival[:, :line] & (least[:, :line] == least[:, line : line + 1])).any(axis=1)
-        assigned[loses, line] = UNMATCHED
+    wanted = np.sort(assigned, axis=1)
+    contested = ((wanted[:, 1:] == wanted[:, :-1]) & (wanted[:, 1:] != UNMATCHED)).any(axis=1)
+    for row in np.flatnonzero(contested):
+        taken: set[int] = set()
+        for line in np.argsort(least[row], kind="stable"):
+            if assigned[row, line] in taken:
+                assigned[row, line] = UNMATCHED
+            taken.add(int(assigned[row, line]))
     return assigned

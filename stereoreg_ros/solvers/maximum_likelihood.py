@@ -68,43 +68,41 @@ def refine(
     variance, S^-1 / sigma for isotropic noise of sigma pixel.
     """
     m = len(rotations)
-    rotations, translations = rotations.copy(), translations.copy()
     target = np.where(used[..., None], spots_mm, 0.0)
-    residual, information, gradient, cuts = _normal_equations(frame, rotations, translations, target, used, whitening)
-    chi_square = np.einsum("mnk,mnk->m", residual, residual)
-    damping = np.full(m, _FIRST_DAMPING)
+    state = _evaluate(frame, rotations, translations, target, used, whitening)
+    # Where poses at rest are written to; the others go on among themselves.
+    ended = _State(*(part.copy() for part in state))
     converged = np.zeros(m, dtype=bool)
-    active = np.arange(m)
-    for _ in range(iterations):
-        if not active.size:
-            break
-        diagonal = np.einsum("mii->mi", information[active])
+    rows, damping = np.arange(m), np.full(m, _FIRST_DAMPING)
+    for number in range(iterations if m else 0):
+        damped = state.information.copy()
+        diagonal = np.einsum("mii->mi", damped)
         # The floor keeps a direction that the spots do not determine at all from making the system singular.
-        floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-12
-        damped = information[active].copy()
-        np.einsum("mii->mi", damped)[:] += damping[active, None] * diagonal + floor
-        step = np.asarray(np.linalg.solve(damped, gradient[active][..., None])[..., 0], dtype=np.float64)
-        tried_rotations = rotation_exp(step[:, 3:]) @ rotations[active]
-        tried_translations = translations[active] + step[:, :3]
-        new = _normal_equations(frame, tried_rotations, tried_translations, target[active], used[active], whitening)
-        new_chi_square = np.einsum("mnk,mnk->m", new[0], new[0])
-        old = chi_square[active]
+        diagonal += damping[:, None] * diagonal + (1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-12)
+        step: Array = np.linalg.solve(damped, state.gradient[..., None])[..., 0].astype(np.float64, copy=False)
+        turned = rotation_exp(step[:, 3:]) @ state.rotations
+        tried = _evaluate(frame, turned, state.translations + step[:, :3], target, used, whitening)
+        old = state.chi_square
         # A pose that loses a cut has NaN here, which is not better.
-        better = new_chi_square <= old
-        gain = old - new_chi_square
-        settled = np.abs(gain) <= _STILL * (1.0 + old)
-        taken = active[better]
-        rotations[taken], translations[taken] = tried_rotations[better], tried_translations[better]
-        information[taken], gradient[taken] = new[1][better], new[2][better]
-        chi_square[taken] = new_chi_square[better]
-        damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 10.0)
-        converged[active[settled & better]] = True
-        stuck = damping[active] > _LARGEST_DAMPING
-        # No step however short helps: at the optimum to rounding, or at a cut that is about to be lost.
-        converged[active[stuck & (np.abs(gain) <= 1e-6 * (1.0 + old))]] = True
-        active = active[~(settled & better) & ~stuck]
-    cuts = cut(frame, rotations, translations)
-    return Refined(rotations, translations, chi_square, information, converged, cuts)
+        better = tried.chi_square <= old
+        gain = np.abs(old - tried.chi_square)
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+        state = tried if better.all() else state.replaced(tried, better)
+        settled = better & (gain <= _STILL * (1.0 + old))
+        stuck = damping > _LARGEST_DAMPING
+        resting = settled | stuck
+        if resting.any() or number == iterations - 1:
+            for kept, now in zip(ended, state, strict=True):
+                kept[rows] = now
+            # No step however short helps: at the optimum to rounding, or at a cut that is about to be lost.
+            converged[rows] = settled | (stuck & (gain <= 1e-6 * (1.0 + old)))
+            if resting.all():
+                break
+            going = ~resting
+            rows, damping, target, used = rows[going], damping[going], target[going], used[going]
+            state = _State(*(part[going] for part in state))
+    cuts = cut(frame, ended.rotations, ended.translations)
+    return Refined(ended.rotations, ended.translations, ended.chi_square, ended.information, converged, cuts)
 
 
 def solve_maximum_likelihood(
@@ -142,22 +140,40 @@ def solve_maximum_likelihood(
     return [solution for _, solution in found]
 
 
-def _normal_equations(
+class _State(NamedTuple):
+    """Poses (m, 3, 3), (m, 3) mm with chi-square (m,), J'J (m, 6, 6) and J'r (m, 6) of their whitened residuals r."""
+
+    rotations: Array
+    translations: Array
+    chi_square: Array
+    information: Array
+    gradient: Array
+
+    def replaced(self, other: _State, rows: NDArray[np.bool_]) -> _State:
+        """These poses, but in the given rows those of another state."""
+        return _State(
+            *(
+                np.where(rows.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+                for new, old in zip(other, self, strict=True)
+            )
+        )
+
+
+def _evaluate(
     frame: Frame,
     rotations: Array,
     translations: Array,
     target: Array,
     used: NDArray[np.bool_],
     whitening: Array,
-) -> tuple[Array, Array, Array, Cuts]:
-    """Whitened residuals (m, n, 2), J'J (m, 6, 6), J'r (m, 6) and the cuts."""
+) -> _State:
+    m, n = used.shape
     cuts = cut(frame, rotations, translations)
     mask = used[..., None]
-    residual = np.where(mask, target - cuts.points_mm, 0.0) @ whitening.T
+    residual = (np.where(mask, target - cuts.points_mm, 0.0) @ whitening.T).reshape(m, 2 * n, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        jacobian = np.where(mask[..., None], whitening @ cut_jacobian(cuts, translations), 0.0)
-    m, n = used.shape
-    flat = jacobian.reshape(m, 2 * n, 6)
+        jacobian = whitening @ cut_jacobian(cuts, translations)
+    flat = np.where(mask[..., None], jacobian, 0.0).reshape(m, 2 * n, 6)
     turned = np.swapaxes(flat, 1, 2)
-    gradient = (turned @ residual.reshape(m, 2 * n, 1))[..., 0]
-    return residual, turned @ flat, gradient, cuts
+    chi_square = np.einsum("mki,mki->m", residual, residual)
+    return _State(rotations, translations, chi_square, turned @ flat, (turned @ residual)[..., 0])
