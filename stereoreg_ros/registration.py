@@ -21,6 +21,7 @@ from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.matching import maurin2009, three_line
 from stereoreg_ros.matching.consensus import Spots
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
 from stereoreg_ros.spots import find_spots
@@ -100,7 +101,8 @@ def register_spots(
 
     spots = _prepare(spots_px, scale, options.spot_noise_px, slice_area_mm2)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
-    hypotheses = _MATCHERS[options.matcher](spots, frame, nominal, options)
+    prior = Prior(nominal, math.radians(options.max_rotation_deg))
+    hypotheses = _MATCHERS[options.matcher](spots, frame, prior, options)
     estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in hypotheses)
     if not estimates:
         return refuse(

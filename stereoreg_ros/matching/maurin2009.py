@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle
+from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.consensus import Spots, distinct, judged
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION, POSE_RANK, assemble, condition_number
 from stereoreg_ros.solvers.ls_tz import solve_system
@@ -105,9 +106,7 @@ def search(
     return Search(ranked, drawn, planned, time.perf_counter() - started)
 
 
-def match(
-    spots: Spots, frame: Frame, nominal_slice_from_frame: Array, options: RegistrationOptions
-) -> list[Hypothesis]:
+def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> list[Hypothesis]:
     """Explanations by the paper's search, refined and judged, best first; none where no sample qualified.
 
     Same form as `matching.three_line.match`. Being random, it may miss what is there.
@@ -126,9 +125,7 @@ def match(
         spot_of_line != UNMATCHED,
         spots.whitening,
     )
-    angle = rotation_angle(refined.rotations @ nominal_slice_from_frame.T)
-    max_rotation = float(np.radians(options.max_rotation_deg))
-    kept = refined.converged & (angle <= max_rotation)
+    kept = refined.converged & (prior.angles(refined.rotations) <= prior.max_rotation)
     found = [
         Hypothesis(
             refined.rotations[i],

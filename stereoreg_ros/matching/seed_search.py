@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, rotation_angle
-from stereoreg_ros.geometry.projection import cut
+from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.matching.consensus import GATE, Spots
 from stereoreg_ros.matching.hypothesis import UNMATCHED
+from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.significance import LEAST_COSINE
 from stereoreg_ros.solvers.three_lines import PAIRS, Seeds, ThreeLineSolver
 
@@ -21,8 +21,10 @@ END_SLACK_MM = 1.0
 _SEED_GATE = 2 * GATE
 # Spots whose triangle is flatter than this (height over longest side) fix no pose: rods of one plane.
 _LEAST_FLATNESS = 0.03
-# Predictions times spots looked at in one piece: bounds the memory.
-_PIECE = 2_000_000
+# Triples of spots looked at in one piece: what belongs to it then stays in the processor's cache.
+_PIECE = 4096
+# Stripes of the slice in which spots are looked up.
+_STRIPES = 256
 
 
 class Starts(NamedTuple):
@@ -43,16 +45,17 @@ class Starts(NamedTuple):
 
 
 class SeedSearch(NamedTuple):
-    """The seeds of one triple of rods, with every spot that each further rod may have.
+    """The seeds of one triple of rods that hit enough spots, m of them, with every spot that each further rod may have.
 
-    spot_of_line: (m, n), the three spots of each seed. hit_seed, hit_line, hit_spot: (h,), a further rod whose
-    prediction a spot is near; hit_rank: (h,), 0 for the rod of that seed that is predicted the sharpest, and so on;
-    nearest_hits: (m, n), spot_of_line with the nearest hit of every rod.
-    reach: (m,), three and the number of further rods that are hit: no consensus of the seed can have more.
-    seeds_by_visible: at v, how many seeds have the slice cut v further rods, those that lean too far left out.
+    rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame. spot_of_line: (m, n), the three spots of each seed.
+    hit_seed, hit_line, hit_spot: (h,), a further rod whose prediction a spot is near; hit_rank: (h,), 0 for the rod of
+    that seed that is predicted the sharpest, and so on; nearest_hits: (m, n), spot_of_line with the nearest hit of
+    every rod. reach: (m,), three and the number of further rods that are hit: no consensus of the seed can have more.
+    seeds_by_visible: at v, how many seeds, whatever they hit, have the slice cut v further rods and lie within the prior.
     """
 
-    seeds: Seeds
+    rotations: Array
+    translations: Array
     spot_of_line: NDArray[np.intp]
     hit_seed: NDArray[np.intp]
     hit_line: NDArray[np.intp]
@@ -81,64 +84,53 @@ class SeedSearch(NamedTuple):
         full[clash] = UNMATCHED
         more = (full != UNMATCHED).sum(axis=1) > 4
         rows = np.concatenate([seed, seed[more]])
-        return Starts(
-            self.seeds.rotations[rows], self.seeds.translations[rows], np.concatenate([spot_of_line, full[more]]), rows
-        )
+        return Starts(self.rotations[rows], self.translations[rows], np.concatenate([spot_of_line, full[more]]), rows)
 
 
 def search_seeds(
-    spots: Spots, frame: Frame, solver: ThreeLineSolver, nominal_slice_from_frame: Array, max_rotation: float
+    spots: Spots, frame: Frame, solver: ThreeLineSolver, rods_cut: int, prior: Prior, min_inliers: int
 ) -> SeedSearch:
-    """All seeds of the solver's rods within `max_rotation` (rad) of the nominal rotation (3, 3), and what they hit."""
-    triples = spot_triples(spots.mm, solver)
-    seeds = solver.solve(spots.mm[triples])
-    if max_rotation < np.pi:
-        seeds = seeds.take(rotation_angle(seeds.rotations @ nominal_slice_from_frame.T) <= max_rotation)
+    """The seeds of the solver's rods where a slice may cut `rods_cut` rods, within the prior, and what they hit.
+
+    Only seeds that hit enough for a consensus of `min_inliers` rods are kept.
+    """
     lines = list(solver.lines)
     others = np.array([line for line in range(len(frame)) if line not in lines])
-    own_spots = triples[seeds.triples]
-    spot_of_line = np.full((len(own_spots), len(frame)), UNMATCHED)
-    spot_of_line[:, lines] = own_spots
-    visible = np.empty(len(own_spots), dtype=np.intp)
+    table = solver.table(rods_cut)
+    cells = None if prior.max_rotation >= np.pi else solver.cells_near(prior.normal, prior.seed_angle)
+    triples = spot_triples(spots.mm, lines, table.low, table.high, prior)
+    stripes = _Stripes.of(spots.mm)
     pieces = []
-    size = max(1, _PIECE // (len(spots.mm) * max(len(others), 1)))
-    for start in range(0, len(own_spots), size):
-        rows = slice(start, start + size)
-        seen, hits = _predict(spots, frame, lines, others, own_spots[rows], seeds.take(rows))
-        visible[rows] = seen
-        pieces.append((hits[0] + start, *hits[1:]))
-    if pieces:
-        hit_seed, hit_other, hit_spot, sharpness, squared = (
-            np.concatenate(parts) for parts in zip(*pieces, strict=True)
-        )
-    else:
-        hit_seed, hit_other, hit_spot = (np.empty(0, dtype=np.intp) for _ in range(3))
-        sharpness = squared = np.empty(0)
-    nearest_hits = spot_of_line.copy()
-    farthest_first = np.argsort(-squared, kind="stable")  # so that the nearest is written last
-    nearest_hits[hit_seed[farthest_first], others[hit_other[farthest_first]]] = hit_spot[farthest_first]
-    rank, rods_hit = _rank_rods(hit_seed, hit_other, sharpness, len(own_spots), len(others))
-    return SeedSearch(
-        seeds,
-        spot_of_line,
-        hit_seed,
-        others[hit_other],
-        hit_spot,
-        rank,
-        nearest_hits,
-        3 + rods_hit,
-        np.bincount(visible[visible >= 0], minlength=len(others) + 1).astype(np.int64),
-    )
+    for start in range(0, max(len(triples), 1), _PIECE):
+        piece = triples[start : start + _PIECE]
+        seeds = solver.solve(spots.mm[piece], table, cells)
+        own_spots = piece[seeds.triples]
+        counts = np.ones(len(own_spots), dtype=bool)
+        if cells is not None:
+            turned = prior.angles(solver.poses(seeds.lambdas, spots.mm[own_spots])[0])
+            near = turned <= prior.seed_angle
+            counts = turned[near] <= prior.max_rotation
+            own_spots, seeds = own_spots[near], seeds.take(near)
+        predicted = _predict(spots, frame, solver, others, own_spots, seeds)
+        visible = np.bincount(predicted.visible[counts & predicted.upright], minlength=len(others) + 1)
+        hits = _hits(spots, stripes, predicted, own_spots, others, prior)
+        pieces.append(_kept(spots, frame, solver, others, own_spots, seeds, hits, visible, min_inliers))
+    return _merged(pieces)
 
 
-def spot_triples(mm: Array, solver: ThreeLineSolver) -> NDArray[np.intp]:
-    """Rows (t, 3) of distinct spots (s, 2) at distances that the three rods can have, not nearly collinear."""
+def spot_triples(mm: Array, lines: list[int], low: Array, high: Array, prior: Prior) -> NDArray[np.intp]:
+    """Rows (t, 3) of distinct spots (s, 2) mm that three rods can have, not nearly collinear.
+
+    low, high: (3,) mm, bounds of the three distances, in the order of PAIRS.
+    """
     x, y = mm[:, 0][:, None] - mm[:, 0], mm[:, 1][:, None] - mm[:, 1]
     distance = np.sqrt(x * x + y * y)
     allowed = []
-    for row in range(len(PAIRS)):
-        pair = (distance >= solver.distance_low[row]) & (distance <= solver.distance_high[row])
+    for row, (a, b) in enumerate(PAIRS):
+        pair = (distance >= low[row]) & (distance <= high[row])
         np.fill_diagonal(pair, False)
+        if prior.spots_of_line is not None:
+            pair &= prior.spots_of_line[lines[a]][:, None] & prior.spots_of_line[lines[b]]
         allowed.append(pair)
     first, second = np.nonzero(allowed[0])
     pair_row, third = np.nonzero(allowed[1][first] & allowed[2][second])
@@ -149,84 +141,206 @@ def spot_triples(mm: Array, solver: ThreeLineSolver) -> NDArray[np.intp]:
     return np.stack([first[spread], second[spread], third[spread]], axis=1)
 
 
+class _Stripes(NamedTuple):
+    """Spots sorted by x, and where each stripe of the slice starts among them."""
+
+    order: NDArray[np.intp]
+    low: float
+    width: float
+    start: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, mm: Array) -> _Stripes:
+        order = np.argsort(mm[:, 0], kind="stable")
+        x = mm[order, 0]
+        width = max(float(x[-1] - x[0]) / _STRIPES, 1e-6)
+        return cls(order, float(x[0]), width, np.searchsorted(x, x[0] + width * np.arange(_STRIPES + 2)))
+
+    def between(self, low: Array, high: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of the ranges low to high (p,) mm and of the spots whose stripe they touch."""
+        first = np.clip((low - self.low) / self.width, 0, _STRIPES + 1).astype(np.intp)
+        last = np.clip((high - self.low) / self.width + 1, 0, _STRIPES + 1).astype(np.intp)
+        start = self.start[first]
+        count = np.where(high >= self.low, self.start[last] - start, 0)
+        row = np.repeat(np.arange(len(count)), count)
+        rank = np.arange(len(row)) - (np.cumsum(count) - count)[row]
+        return row, self.order[start[row] + rank]
+
+
+class _Prediction(NamedTuple):
+    """Where m seeds have the slice cut k further rods; arrays are (k, m).
+
+    x, y: mm in the slice; xx, yy, xy: their covariance, mm^2, with the noise of the spot that is looked for; on_rod:
+    whether the cut may lie on the rod. visible (m,): how many rods the seed has the slice cut; upright (m,): whether
+    it has its own rods leave the slice steeply enough to count.
+    """
+
+    x: Array
+    y: Array
+    xx: Array
+    yy: Array
+    xy: Array
+    on_rod: NDArray[np.bool_]
+    visible: NDArray[np.intp]
+    upright: NDArray[np.bool_]
+
+
 def _predict(
     spots: Spots,
     frame: Frame,
-    lines: list[int],
+    solver: ThreeLineSolver,
     others: NDArray[np.intp],
     own_spots: NDArray[np.intp],
     seeds: Seeds,
-) -> tuple[NDArray[np.intp], tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Array, Array]]:
-    """How many further rods each seed has the slice cut (m,), -1 for one that does not count, and the hits.
+) -> _Prediction:
+    """Where each seed has the slice cut the further rods.
 
-    Of a hit: seed, further rod, spot, size and distance. The size is the determinant of the prediction's covariance,
-    mm^4; the distance is squared, in standard deviations.
-
-    A further rod's cut follows the seed's positions lambda: its point moves by w = slope y_z - y_xy of each seed rod,
-    weighted by the cut's barycentric coordinate in the seed's triangle.
+    The three points of a seed span the slice, in the frame as in the image: what is known in terms of two sides of the
+    triangle in the one is known in the other, without a pose. A further rod's cut follows the seed's positions lambda:
+    its point moves by w = slope y_z - y_xy of each seed rod, weighted by the cut's barycentric coordinate.
     """
-    cuts = cut(frame, seeds.rotations, seeds.translations)
-    directions = cuts.directions
-    corner = spots.mm[own_spots]
-    where_x, where_y = cuts.points_mm[:, others, 0], cuts.points_mm[:, others, 1]
-    ax, ay = corner[:, 1, 0] - corner[:, 0, 0], corner[:, 1, 1] - corner[:, 0, 1]
-    bx, by = corner[:, 2, 0] - corner[:, 0, 0], corner[:, 2, 1] - corner[:, 0, 1]
-    inverse = (1.0 / (ax * by - ay * bx))[:, None]
-    dx, dy = where_x - corner[:, 0, 0, None], where_y - corner[:, 0, 1, None]
-    second = (dx * by[:, None] - dy * bx[:, None]) * inverse
-    third = (dy * ax[:, None] - dx * ay[:, None]) * inverse
-    weights = (1.0 - second - third, second, third)
+    points = np.ascontiguousarray(np.moveaxis(solver.points(seeds.lambdas), 0, -1))  # (3 rods, 3 axes, m)
+    u, v = points[1] - points[0], points[2] - points[0]
+    normal = _cross(u, v)
+    squared = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
+    # Dual to the sides: a vector's components along u and v are its products with these.
+    dual_u, dual_v = _cross(v, normal) / squared, _cross(normal, u) / squared
+    corner_x, corner_y = np.ascontiguousarray(spots.mm[own_spots].transpose(2, 1, 0))
+    ax, ay = corner_x[1] - corner_x[0], corner_y[1] - corner_y[0]
+    bx, by = corner_x[2] - corner_x[0], corner_y[2] - corner_y[0]
+    unit = np.copysign(1.0 / np.sqrt(squared), ax * by - ay * bx)
+
+    def in_slice(rows: NDArray[np.intp] | list[int]) -> tuple[Array, Array, Array]:
+        """Directions of rods, components (rods, m) in slice axes."""
+        y = frame.directions[rows]
+        along_u, along_v = y @ dual_u, y @ dual_v
+        return along_u * ax + along_v * bx, along_u * ay + along_v * by, (y @ normal) * unit
+
+    own_x, own_y, own_z = in_slice(list(solver.lines))
+    to_x, to_y, to_z = in_slice(others)
+    directions, origins = frame.directions[others], frame.origins[others]
     with np.errstate(invalid="ignore", divide="ignore"):
-        along = 1.0 / directions[:, others, 2]
-        slope_x, slope_y = directions[:, others, 0] * along, directions[:, others, 1] * along
-    moved_x, moved_y = [], []
-    for weight, line in zip(weights, lines, strict=True):
-        own = directions[:, line, :, None]
-        moved_x.append(weight * (slope_x * own[:, 2] - own[:, 0]))
-        moved_y.append(weight * (slope_y * own[:, 2] - own[:, 1]))
-    noise = spots.sigma_mm**2 * (1.0 + weights[0] ** 2 + weights[1] ** 2 + weights[2] ** 2)
-    xx, yy, xy = noise, noise.copy(), np.zeros_like(noise)
-    for i in range(3):
-        for j in range(3):
-            covariance = seeds.lambda_covariance[:, i, j, None]
-            xx = xx + covariance * moved_x[i] * moved_x[j]
-            yy = yy + covariance * moved_y[i] * moved_y[j]
-            xy = xy + covariance * moved_x[i] * moved_y[j]
-    with np.errstate(invalid="ignore"):
+        inverse = 1.0 / to_z
+        lambdas = ((normal * points[0]).sum(axis=0) - origins @ normal) * unit * inverse
+        slope_x, slope_y = to_x * inverse, to_y * inverse
+        second = origins @ dual_u - (dual_u * points[0]).sum(axis=0) + lambdas * (directions @ dual_u)
+        third = origins @ dual_v - (dual_v * points[0]).sum(axis=0) + lambdas * (directions @ dual_v)
+        weights = (1.0 - second - third, second, third)
+        xx = spots.sigma_mm**2 * (1.0 + weights[0] ** 2 + weights[1] ** 2 + weights[2] ** 2)
+        yy, xy = xx.copy(), np.zeros_like(xx)
+        moved_x = [weights[i] * (slope_x * own_z[i] - own_x[i]) for i in range(3)]
+        moved_y = [weights[i] * (slope_y * own_z[i] - own_y[i]) for i in range(3)]
+        for i in range(3):
+            row = [seeds.lambda_covariance[:, i, j] for j in range(3)]
+            by_x = row[0] * moved_x[0] + row[1] * moved_x[1] + row[2] * moved_x[2]
+            by_y = row[0] * moved_y[0] + row[1] * moved_y[1] + row[2] * moved_y[2]
+            xx += moved_x[i] * by_x
+            yy += moved_y[i] * by_y
+            xy += moved_x[i] * by_y
         # How far the cut may yet slide along its rod.
-        slide = 4.0 * np.sqrt(np.maximum(xx, yy)) / np.maximum(np.sqrt(slope_x**2 + slope_y**2), 0.1)
-        low, high = frame.lambda_min[others] - END_SLACK_MM, frame.lambda_max[others] + END_SLACK_MM
-        lambdas = cuts.lambdas[:, others]
-        sound = np.abs(directions[:, others, 2]) >= LEAST_COSINE
-        seen = ((lambdas >= low) & (lambdas <= high) & sound).sum(axis=1)
-        # A pose that leans its own rods so far is not one that is sought, though it may lead to one.
-        seen[(np.abs(directions[:, lines, 2]) < LEAST_COSINE).any(axis=1)] = -1
+        slide = 4.0 * np.sqrt(np.maximum(xx, yy) / np.maximum(slope_x**2 + slope_y**2, 0.01))
+        low, high = frame.lambda_min[others, None] - END_SLACK_MM, frame.lambda_max[others, None] + END_SLACK_MM
+        upright = np.abs(to_z) >= LEAST_COSINE
+        visible = ((lambdas >= low) & (lambdas <= high) & upright).sum(axis=0)
         on_rod = (lambdas >= low - slide) & (lambdas <= high + slide)
-        determinant = xx * yy - xy * xy
-    seed, other = np.nonzero(on_rod)
-    chosen = (seed, other)
-    xx, yy, xy, determinant = xx[chosen], yy[chosen], xy[chosen], determinant[chosen]
+    # A seed that leans its own rods too far is not one that is sought, though it may lead to one.
+    own_upright = np.abs(own_z).min(axis=0) >= LEAST_COSINE
+    x = corner_x[0] + second * ax + third * bx
+    y = corner_y[0] + second * ay + third * by
+    return _Prediction(x, y, xx, yy, xy, on_rod, visible, own_upright)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products of vectors (3, m)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+class _Hits(NamedTuple):
+    """Spots near predictions. area: determinant of the prediction's covariance, mm^4; squared: distance, in standard
+    deviations, squared.
+    """
+
+    seed: NDArray[np.intp]
+    other: NDArray[np.intp]
+    spot: NDArray[np.intp]
+    area: Array
+    squared: Array
+
+    def take(self, rows: NDArray[np.intp]) -> _Hits:
+        return _Hits(*(part[rows] for part in self))
+
+
+def _hits(
+    spots: Spots,
+    stripes: _Stripes,
+    predicted: _Prediction,
+    own_spots: NDArray[np.intp],
+    others: NDArray[np.intp],
+    prior: Prior,
+) -> _Hits:
+    chosen = np.flatnonzero(predicted.on_rod)
+    x, y, xx, yy, xy = (
+        part.ravel()[chosen] for part in (predicted.x, predicted.y, predicted.xx, predicted.yy, predicted.xy)
+    )
+    reach = np.sqrt(_SEED_GATE * xx)
+    row, spot = stripes.between(x - reach, x + reach)
     # Most spots are far from most predictions: a box around the gate sorts them out before the ellipse is looked at.
-    reach_x, reach_y = np.sqrt(_SEED_GATE * xx), np.sqrt(_SEED_GATE * yy)
-    off_x = spots.mm[:, 0] - where_x[chosen][:, None]
-    near = np.abs(off_x) <= reach_x[:, None]
-    off_y = spots.mm[:, 1] - where_y[chosen][:, None]
-    near &= np.abs(off_y) <= reach_y[:, None]
-    prediction, spot = np.nonzero(near)
-    off_x, off_y = off_x[prediction, spot], off_y[prediction, spot]
-    squared = yy[prediction] * off_x**2 + xx[prediction] * off_y**2 - 2 * xy[prediction] * off_x * off_y
-    inside = squared <= _SEED_GATE * determinant[prediction]
-    inside &= (own_spots[seed[prediction]] != spot[:, None]).all(axis=1)
-    prediction, spot = prediction[inside], spot[inside]
-    determinant = determinant[prediction]
-    return seen, (seed[prediction], other[prediction], spot, determinant, squared[inside] / determinant)
+    off_y = spots.mm[spot, 1] - y[row]
+    near = off_y * off_y <= _SEED_GATE * yy[row]
+    row, spot, off_y = row[near], spot[near], off_y[near]
+    off_x = spots.mm[spot, 0] - x[row]
+    area = xx[row] * yy[row] - xy[row] ** 2
+    squared = yy[row] * off_x**2 + xx[row] * off_y**2 - 2 * xy[row] * off_x * off_y
+    other, seed = np.divmod(chosen[row], max(len(own_spots), 1))
+    inside = (squared <= _SEED_GATE * area) & (own_spots[seed] != spot[:, None]).all(axis=1)
+    if prior.spots_of_line is not None:
+        inside &= prior.spots_of_line[others[other], spot]
+    return _Hits(seed[inside], other[inside], spot[inside], area[inside], squared[inside] / area[inside])
 
 
-def _rank_rods(
-    hit_seed: NDArray[np.intp], hit_other: NDArray[np.intp], sharpness: Array, seeds: int, others: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each hit the rank of its rod among those hit of its seed, smallest gate first; and how many rods are hit."""
-    gate = np.full((seeds, others), np.inf)
-    gate[hit_seed, hit_other] = sharpness
-    order = np.argsort(np.argsort(gate, axis=1, kind="stable"), axis=1, kind="stable")
-    return order[hit_seed, hit_other], np.isfinite(gate).sum(axis=1)
+def _kept(
+    spots: Spots,
+    frame: Frame,
+    solver: ThreeLineSolver,
+    others: NDArray[np.intp],
+    own_spots: NDArray[np.intp],
+    seeds: Seeds,
+    hits: _Hits,
+    seeds_by_visible: NDArray[np.intp],
+    min_inliers: int,
+) -> SeedSearch:
+    """The seeds that hit enough rods, with their hits in order."""
+    gate = np.full((len(own_spots), len(others)), np.inf)
+    gate[hits.seed, hits.other] = hits.area
+    reach = 3 + np.isfinite(gate).sum(axis=1)
+    rows = np.flatnonzero(reach >= min_inliers)
+    hits = hits.take(np.flatnonzero(reach[hits.seed] >= min_inliers))
+    hit_seed, hit_line = np.searchsorted(rows, hits.seed), others[hits.other]
+    order = np.argsort(np.argsort(gate[rows], axis=1, kind="stable"), axis=1, kind="stable")
+    spot_of_line = np.full((len(rows), len(frame)), UNMATCHED)
+    spot_of_line[:, list(solver.lines)] = own_spots[rows]
+    nearest_hits = spot_of_line.copy()
+    farthest_first = np.argsort(-hits.squared, kind="stable")  # so that the nearest is written last
+    nearest_hits[hit_seed[farthest_first], hit_line[farthest_first]] = hits.spot[farthest_first]
+    return SeedSearch(
+        *solver.poses(seeds.lambdas[rows], spots.mm[own_spots[rows]]),
+        spot_of_line,
+        hit_seed,
+        hit_line,
+        hits.spot,
+        order[hit_seed, hits.other],
+        nearest_hits,
+        reach[rows],
+        seeds_by_visible.astype(np.int64),
+    )
+
+
+def _merged(pieces: list[SeedSearch]) -> SeedSearch:
+    if len(pieces) == 1:
+        return pieces[0]
+    before = np.cumsum([0, *(len(piece.reach) for piece in pieces[:-1])])
+    numbered = [
+        piece._replace(hit_seed=piece.hit_seed + first) for piece, first in zip(pieces, before.tolist(), strict=True)
+    ]
+    joined = (np.concatenate(parts) for parts in zip(*(piece[:-1] for piece in numbered), strict=True))
+    return SeedSearch(*joined, np.sum([piece.seeds_by_visible for piece in pieces], axis=0))

@@ -3,12 +3,13 @@
 Unknown are the positions lambda (3) at which the slice cuts the rods; the three distances between the spots are known.
 Each squared distance is a quadratic in two of them. The rods are divided into cells once; a table from distances to
 cells says which cells a triple of spots can belong to, and a few damped steps from a cell's centre reach the solution
-in it, so that no starting guess is needed. Where noise has pushed a double root off the
-real axis, as parallel rods and a slice at right angles to them make normal, the steps end at the nearest point.
+in it, so that no starting guess is needed. Where noise has pushed a double root off the real axis, as parallel rods and
+a slice at right angles to them make normal, the steps end at the nearest point.
 """
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -20,46 +21,48 @@ from stereoreg_ros.geometry.pose import Array
 # Pairs of the three rods, in the order of all arrays of three distances.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 _CELLS_PER_ROD = 10
-_STEPS = 6
-_STEPS_BEFORE_SORTING_OUT = 1
+_STEPS = 5
 # Bins of the table along each of the three distances.
-_BINS = 25
+_BINS = 40
+# How much larger the bounds of a cell's distances are made than those of the points tried in it.
+_MARGIN = 1.15
+# Share of the least cosine that is asked for in the points tried in a cell: between them it may be larger.
+_LOOSENED = 0.8
 # Damping of the steps, in units of squared cosines: reached only where a double root is near.
 _DAMPING = 1e-5
 
 
 class Seeds(NamedTuple):
-    """Poses from three rods and three spots, m of them.
+    """Positions along three rods that have the distances of three spots, m of them.
 
-    triples: (m,), row of the triple of spots; rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame;
-    lambdas: (m, 3) mm; lambda_covariance: (m, 3, 3) mm^2, finite at double roots too.
+    triples: (m,), row of the triple of spots; lambdas: (m, 3) mm; lambda_covariance: (m, 3, 3) mm^2, finite at double
+    roots too. Both are stored column by column, as the arithmetic on many seeds is.
     """
 
     triples: NDArray[np.intp]
-    rotations: Array
-    translations: Array
     lambdas: Array
     lambda_covariance: Array
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Seeds:
+    def take(self, rows: NDArray[np.bool_]) -> Seeds:
         """Only the given seeds."""
-        return Seeds(
-            self.triples[rows],
-            self.rotations[rows],
-            self.translations[rows],
-            self.lambdas[rows],
-            self.lambda_covariance[rows],
-        )
+        return Seeds(self.triples[rows], self.lambdas[rows], self.lambda_covariance[rows])
 
 
 class ThreeLineSolver:
     """All poses that put three given rods on three given spots."""
 
-    def __init__(self, frame: Frame, lines: tuple[int, int, int], tolerance_mm: float, end_slack_mm: float) -> None:
+    def __init__(
+        self,
+        frame: Frame,
+        lines: tuple[int, int, int],
+        tolerance_mm: float,
+        end_slack_mm: float,
+        least_cosine: float = 0.0,
+    ) -> None:
         """Prepare for three rods of `frame`, by their rows.
 
         tolerance_mm: how far noise may change a distance between two spots; end_slack_mm: how far beyond its ends a rod
-        may be cut.
+        may be cut; least_cosine: between the slice's normal and a rod that it cuts, below which the cut does not count.
         """
         self.lines = lines
         self.tolerance_mm = tolerance_mm
@@ -83,14 +86,22 @@ class ThreeLineSolver:
         steps = (np.arange(_CELLS_PER_ROD) + 0.5) / _CELLS_PER_ROD
         axes = [low[i] + (high - low)[i] * steps for i in range(3)]
         self._centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._nearest, self._farthest = self._distance_bounds()
-        self.distance_low = self._nearest.min(axis=0) - tolerance_mm
-        self.distance_high = self._farthest.max(axis=0) + tolerance_mm
-        self._fill_table()
+        nearest, farthest = self._distance_bounds()
+        self._nearest, self._farthest = nearest - tolerance_mm, farthest + tolerance_mm
+        self._box = self._oblique_bounds()
+        self._normals, self._normal_spread, self.rods_cut = self._planes(frame, least_cosine)
+        self._tables: dict[int, _Table] = {}
 
-    def _points(self, lambdas: Array) -> Array:
+    def points(self, lambdas: Array) -> Array:
+        """Points (..., 3, 3) mm of the frame at positions (..., 3) mm along the three rods."""
         points: Array = self._origins + lambdas[..., None] * self._directions
         return points
+
+    def _samples(self) -> Array:
+        """Positions (cells, 27, 3) mm in every cell: its centre (row 13), and the middles and corners of its faces."""
+        offsets = 0.5 * np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+        samples: Array = self._centres[:, None] + offsets * self._cell
+        return samples
 
     def _distance_bounds(self) -> tuple[Array, Array]:
         """Least and greatest distances (cells, 3) of the pairs of rods within each cell.
@@ -106,7 +117,7 @@ class ThreeLineSolver:
                 moved = self._centres.copy()
                 moved[:, a] += shift_a
                 moved[:, b] += shift_b
-                points = self._points(moved)
+                points = self.points(moved)
                 difference: Array = points[:, a] - points[:, b]
                 return difference
 
@@ -119,93 +130,126 @@ class ThreeLineSolver:
             farthest.append(np.max(corners, axis=0))
         return np.stack(nearest, axis=1), np.stack(farthest, axis=1)
 
-    def _fill_table(self) -> None:
-        """Bins over the three distances, each with the cells that can have them."""
-        span = self.distance_high - self.distance_low
-        self._bin = np.maximum(span / (_BINS - 1), 1e-6)
-        first = ((self._nearest - self.tolerance_mm - self.distance_low) / self._bin).astype(np.intp)
-        last = ((self._farthest + self.tolerance_mm - self.distance_low) / self._bin).astype(np.intp)
-        first, last = np.clip(first, 0, _BINS - 1), np.clip(last, 0, _BINS - 1)
-        extent = last - first + 1
-        count = extent.prod(axis=1)
-        cell = np.repeat(np.arange(len(count)), count)
-        rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        x = rank % extent[cell, 0]
-        y = rank // extent[cell, 0] % extent[cell, 1]
-        z = rank // (extent[cell, 0] * extent[cell, 1])
-        flat = self._flat(first[cell] + np.stack([x, y, z], axis=1))
-        order = np.argsort(flat, kind="stable")
-        self._table = cell[order]
-        self._table_start = np.searchsorted(flat[order], np.arange(_BINS**3 + 1))
+    def _planes(self, frame: Frame, least_cosine: float) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Of each cell, the slice's normal in the frame (cells, 3), up to sign, how far it turns within the cell
+        (cells,) in rad, and how many rods a slice there may cut (cells,): 0 where not the three themselves.
+        """
+        corners = self.points(self._samples())
+        normals = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+        cosine = np.einsum("csi,ni->csn", normals, frame.directions)
+        at_least = _LOOSENED * least_cosine
+        crosses = np.abs(cosine) >= max(at_least, 1e-9)
+        height = np.einsum("csi,csi->cs", normals, corners[..., 0, :])[..., None] - normals @ frame.origins.T
+        lambdas = height / np.where(crosses, cosine, 1.0)
+        reach = (self.lambda_high - self.lambda_low).max() / _CELLS_PER_ROD / 2
+        cut = crosses & (lambdas >= frame.lambda_min - reach) & (lambdas <= frame.lambda_max + reach)
+        cut[..., list(self.lines)] = crosses[..., list(self.lines)]
+        possible = cut.any(axis=1)
+        rods_cut = np.where(possible[:, list(self.lines)].all(axis=1), possible.sum(axis=1), 0)
+        centre = normals[:, 13]
+        turned = np.abs(np.einsum("csi,ci->cs", normals, centre)).min(axis=1)
+        return centre, np.arccos(np.minimum(turned, 1.0)), rods_cut
 
-    def _flat(self, bins: NDArray[np.intp]) -> NDArray[np.intp]:
-        flat: NDArray[np.intp] = (bins[:, 0] * _BINS + bins[:, 1]) * _BINS + bins[:, 2]
-        return flat
+    def cells_near(self, normal: Array, angle: float) -> NDArray[np.bool_]:
+        """Cells (cells,) where the slice's normal may be within `angle` (rad) of a given one (3,) in the frame, or of its
+        opposite.
+        """
+        between = np.arccos(np.minimum(np.abs(self._normals @ normal), 1.0))
+        near: NDArray[np.bool_] = between <= angle + self._normal_spread
+        return near
 
-    def solve(self, spots_mm: Array) -> Seeds:
-        """Poses for triples of spots (t, 3, 2) mm in the slice; the spots in the order of the rods."""
-        sides = np.stack([spots_mm[:, a] - spots_mm[:, b] for a, b in PAIRS], axis=1)
-        distances = np.sqrt((sides**2).sum(axis=-1))
-        triple, cell = self._candidates(distances)
-        known = [np.ascontiguousarray(distances[triple, pair]) for pair in range(3)]
-        start = [np.ascontiguousarray(self._centres[cell, rod]) for rod in range(3)]
-        lambdas = list(start)
-        for number in range(_STEPS):
-            equations = self._equations(lambdas, known)
-            steps = _damped_step(equations)
+    def table(self, rods_cut: int) -> _Table:
+        """From distances to the cells in which a slice may cut just so many rods."""
+        if rods_cut not in self._tables:
+            cells = np.flatnonzero(self.rods_cut == rods_cut)
+            self._tables[rods_cut] = _Table.of(cells, self._nearest[cells], self._farthest[cells])
+        return self._tables[rods_cut]
+
+    def _oblique_bounds(self) -> Array:
+        """Rows (cells, 12) that turn three distances d into three numbers, 9 factors and 3 constants.
+
+        All three lie within -1 and 1 where d can belong to the cell: the distances within a cell form a skewed box,
+        which its own axes bound far more closely than the axes of d do.
+        """
+        samples = self.points(self._samples())
+        distances = np.stack([np.linalg.norm(samples[..., a, :] - samples[..., b, :], axis=-1) for a, b in PAIRS], -1)
+        centre = distances[:, 13]
+        spread = distances - centre[:, None]
+        axes = np.linalg.svd(spread, full_matrices=False)[2]
+        along = spread @ np.swapaxes(axes, 1, 2)
+        low, high = along.min(axis=1), along.max(axis=1)
+        half = _MARGIN * (high - low) / 2 + self.tolerance_mm
+        factors = axes / half[..., None]
+        constants = -np.einsum("cij,cj->ci", factors, centre) - (low + high) / 2 / half
+        return np.concatenate([factors.reshape(-1, 9), constants], axis=1)
+
+    def solve(self, spots_mm: Array, table: _Table, cells: NDArray[np.bool_] | None = None) -> Seeds:
+        """Positions for triples of spots (t, 3, 2) mm in the slice; the spots in the order of the rods.
+
+        table: of the cells in which solutions are sought; cells: (cells,), of these only the ones that are set.
+        """
+        sides = [spots_mm[:, a] - spots_mm[:, b] for a, b in PAIRS]
+        distances = [np.sqrt(side[:, 0] ** 2 + side[:, 1] ** 2) for side in sides]
+        triple, cell = self._candidates(distances, table, cells)
+        known = [distance[triple] for distance in distances]
+        start = [self._centres[:, rod][cell] for rod in range(3)]
+        lambdas = start
+        for _ in range(_STEPS):
             lambdas = [
                 value - np.minimum(np.maximum(step, -size), size)
-                for value, step, size in zip(lambdas, steps, self._cell, strict=True)
+                for value, step, size in zip(
+                    lambdas, _damped_step(self._equations(lambdas, known)), self._cell, strict=True
+                )
             ]
-            if number == _STEPS_BEFORE_SORTING_OUT:
-                # A start that leads away leads to another cell's solution, or to none.
-                near = self._is_near(lambdas, start, 2.0)
-                triple = triple[near]
-                known, start, lambdas = ([part[near] for part in parts] for parts in (known, start, lambdas))
         equations = self._equations(lambdas, known)
-        misfit = np.abs(equations.error[0])
-        for error in equations.error[1:]:
-            np.maximum(misfit, np.abs(error), out=misfit)
-        found = (misfit <= self.tolerance_mm) & self._is_near(lambdas, start, 1.25)
-        for value, low, high in zip(lambdas, self.lambda_low, self.lambda_high, strict=True):
-            found &= (value >= low) & (value <= high)
+        misfit = np.maximum.reduce([np.abs(error) for error in equations.error])
+        found = misfit <= self.tolerance_mm
+        for value, first, size, low, high in zip(
+            lambdas, start, self._cell, self.lambda_low, self.lambda_high, strict=True
+        ):
+            # A start that leads away leads to another cell's solution, or to none.
+            found &= (np.abs(value - first) <= 1.25 * size) & (value >= low) & (value <= high)
         rows = np.flatnonzero(found)
         # Of step ends in one place the best is kept, which is found first when they are sorted by their misfit.
         rows = rows[np.argsort(misfit[rows], kind="stable")]
         key = triple[rows].astype(np.int64)
-        for value, size in zip(lambdas, self._cell, strict=True):
-            key = key * 4096 + np.round(value[rows] / (0.1 * size)).astype(np.int64) % 4096
-        _, first = np.unique(key, return_index=True)
-        kept = rows[np.sort(first)]
-        kept = kept[np.argsort(triple[kept], kind="stable")]
+        for value, low, size in zip(lambdas, self.lambda_low, self._cell, strict=True):
+            key = key * 128 + np.round((value[rows] - low) / (0.1 * size)).astype(np.int64)
+        _, first_of_key = np.unique(key, return_index=True)
+        kept = np.sort(rows[first_of_key])  # in the order of the triples, as the candidates are
         triple = triple[kept]
-        ends = np.column_stack([value[kept] for value in lambdas])
-        rotations, translations = _pose(self._points(ends), spots_mm[triple])
-        covariance = self._covariance(equations.take(kept), distances[triple])
-        return Seeds(triple, rotations, translations, ends, covariance)
+        ends = np.stack([value[kept] for value in lambdas])
+        longest = np.maximum.reduce([distance[triple] for distance in distances])
+        return Seeds(triple, ends.T, self._covariance(equations.take(kept), longest))
 
-    def _candidates(self, distances: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows of triples and of the cells that their distances (t, 3) allow."""
-        possible = ((distances >= self.distance_low) & (distances <= self.distance_high)).all(axis=1)
-        rows = np.flatnonzero(possible)
-        bins = ((distances[rows] - self.distance_low) / self._bin).astype(np.intp)
-        flat = self._flat(np.minimum(bins, _BINS - 1))
-        start, stop = self._table_start[flat], self._table_start[flat + 1]
-        count = stop - start
-        triple = np.repeat(rows, count)
-        cell = self._table[np.arange(len(triple)) + np.repeat(start - (np.cumsum(count) - count), count)]
-        fits = np.ones(len(triple), dtype=bool)
-        for pair in range(3):
-            known = distances[triple, pair]
-            fits &= known >= self._nearest[cell, pair] - self.tolerance_mm
-            fits &= known <= self._farthest[cell, pair] + self.tolerance_mm
+    def poses(self, lambdas: Array, spots_mm: Array) -> tuple[Array, Array]:
+        """slice_from_frame (m, 3, 3), (m, 3) mm that lays the rods' points at lambdas (m, 3) on spots (m, 3, 2)."""
+        points = self.points(lambdas)
+        flat = np.zeros((*spots_mm.shape[:2], 3))
+        flat[..., :2] = spots_mm
+        rotations = _triad(flat) @ np.swapaxes(_triad(points), -1, -2)
+        centre, flat_centre = points.mean(axis=1), flat.mean(axis=1)
+        return rotations, flat_centre - np.einsum("mij,mj->mi", rotations, centre)
+
+    def _candidates(
+        self, distances: list[Array], table: _Table, cells: NDArray[np.bool_] | None
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of triples, in order, and of the cells that their three distances (t,) allow."""
+        triple, cell = table.look_up(distances)
+        if cells is not None:
+            wanted = cells[cell]
+            triple, cell = triple[wanted], cell[wanted]
+        box = self._box.take(cell, axis=0)
+        d0, d1, d2 = (distance[triple] for distance in distances)
+        fits = np.ones(len(cell), dtype=bool)
+        for axis in range(3):
+            value = box[:, 3 * axis] * d0
+            value += box[:, 3 * axis + 1] * d1
+            value += box[:, 3 * axis + 2] * d2
+            value += box[:, 9 + axis]
+            fits &= np.abs(value) <= 1.0
         return triple[fits], cell[fits]
-
-    def _is_near(self, lambdas: list[Array], start: list[Array], cells: float) -> NDArray[np.bool_]:
-        near = np.ones(len(lambdas[0]), dtype=bool)
-        for value, first, size in zip(lambdas, start, self._cell, strict=True):
-            near &= np.abs(value - first) <= cells * size
-        return near
 
     def _equations(self, lambdas: list[Array], distances: list[Array]) -> _Equations:
         """(d^2 - D^2) / 2D for each pair: the distance's error to first order, and smooth where rods meet.
@@ -223,17 +267,69 @@ class ThreeLineSolver:
             slopes.append((slope_a * inverse, slope_b * inverse))
         return _Equations(errors, slopes)
 
-    def _covariance(self, equations: _Equations, distances: Array) -> Array:
+    def _covariance(self, equations: _Equations, longest: Array) -> Array:
         """Covariance (m, 3, 3) mm^2 of the positions, for distances known to a quarter of the tolerance.
 
         At a double root the distance changes only with the square of the position, x^2 / 2D: there a position is known
-        to sqrt(2 D sigma), not to infinity.
+        to sqrt(2 D sigma), not to infinity. longest: (m,), of the three distances D.
         """
         sigma = self.tolerance_mm / 4
-        damping = sigma / (2 * distances.max(axis=1))
-        inverse, determinant = _inverse_normal(equations, damping)
+        inverse, determinant = _inverse_normal(equations, sigma / (2 * longest))
         xx, yy, zz, xy, xz, yz = (part * (sigma**2 / determinant) for part in inverse)
-        return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+        return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3, -1).transpose(2, 0, 1)
+
+
+class _Table(NamedTuple):
+    """Bins over three distances, each with the cells that can have them.
+
+    low, high (3,): outside of which no cell has a distance, mm; size (3,): of a bin, mm; start: where each bin's cells
+    start in `cell`, and where the last one's end.
+    """
+
+    low: Array
+    high: Array
+    size: Array
+    start: NDArray[np.intp]
+    cell: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, cells: NDArray[np.intp], nearest: Array, farthest: Array) -> _Table:
+        """The table of cells (c,) with the least and greatest of their three distances (c, 3) mm."""
+        if not cells.size:
+            return cls(np.full(3, np.inf), np.full(3, -np.inf), np.ones(3), np.zeros(1, dtype=np.intp), cells)
+        low, high = nearest.min(axis=0), farthest.max(axis=0)
+        size = np.maximum((high - low) / (_BINS - 1), 1e-6)
+        first, last = ((nearest - low) / size).astype(np.intp), ((farthest - low) / size).astype(np.intp)
+        extent = last - first + 1
+        count = extent.prod(axis=1)
+        row, rank = _enumerated(count)
+        x = first[row, 0] + rank % extent[row, 0]
+        y = first[row, 1] + rank // extent[row, 0] % extent[row, 1]
+        z = first[row, 2] + rank // (extent[row, 0] * extent[row, 1])
+        flat = (x * _BINS + y) * _BINS + z
+        order = np.argsort(flat, kind="stable")
+        return cls(low, high, size, np.searchsorted(flat[order], np.arange(_BINS**3 + 1)), cells[row[order]])
+
+    def look_up(self, distances: list[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of triples and of cells that share a bin; distances: three times (t,) mm."""
+        possible = np.ones(len(distances[0]), dtype=bool)
+        for distance, low, high in zip(distances, self.low, self.high, strict=True):
+            possible &= (distance >= low) & (distance <= high)
+        rows = np.flatnonzero(possible)
+        x, y, z = (
+            ((distance[rows] - low) / size).astype(np.intp)
+            for distance, low, size in zip(distances, self.low, self.size, strict=True)
+        )
+        flat = (x * _BINS + y) * _BINS + z
+        start = self.start[flat]
+        row, rank = _enumerated(self.start[flat + 1] - start)
+        return rows[row], self.cell[start[row] + rank]
+
+
+def _enumerated(count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """For counts 2, 0, 3: rows 0 0 2 2 2 and ranks 0 1 0 1 2."""
+    row = np.repeat(np.arange(len(count)), count)
+    return row, np.arange(len(row)) - (np.cumsum(count) - count)[row]
 
 
 class _Equations(NamedTuple):
@@ -268,15 +364,6 @@ def _damped_step(equations: _Equations) -> tuple[Array, Array, Array]:
         (cxy * right_x + cyy * right_y + cyz * right_z) * inverse,
         (cxz * right_x + cyz * right_y + czz * right_z) * inverse,
     )
-
-
-def _pose(points: Array, spots_mm: Array) -> tuple[Array, Array]:
-    """slice_from_frame (m, 3, 3), (m, 3) that lays triangles of frame points (m, 3, 3) on spots (m, 3, 2)."""
-    flat = np.zeros((*spots_mm.shape[:2], 3))
-    flat[..., :2] = spots_mm
-    rotations = _triad(flat) @ np.swapaxes(_triad(points), -1, -2)
-    centre, flat_centre = points.mean(axis=1), flat.mean(axis=1)
-    return rotations, flat_centre - np.einsum("mij,mj->mi", rotations, centre)
 
 
 def _triad(triangles: Array) -> Array:
