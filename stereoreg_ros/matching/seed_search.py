@@ -19,10 +19,12 @@ from stereoreg_ros.solvers.three_lines import PAIRS, Seeds, ThreeLineSolver
 END_SLACK_MM = 1.0
 # A seed's prediction is of first order only: its gate need but let the right spot through.
 _SEED_GATE = 2 * GATE
-# Spots whose triangle is flatter than this (height over longest side) fix no pose: rods of one plane.
+# Spots whose triangle is flatter than this (height over a side) fix no pose: rods of one plane.
 _LEAST_FLATNESS = 0.03
+# Two spots nearer than this are one spot found twice.
+_LEAST_DISTANCE_MM = 1e-3
 # Triples of spots looked at in one piece: what belongs to it then stays in the processor's cache.
-_PIECE = 4096
+_PIECE = 12000
 # Stripes of the slice in which spots are looked up.
 _STRIPES = 256
 
@@ -98,19 +100,19 @@ def search_seeds(
     others = np.array([line for line in range(len(frame)) if line not in lines])
     table = solver.table(rods_cut)
     cells = None if prior.max_rotation >= np.pi else solver.cells_near(prior.normal, prior.seed_angle)
-    triples = spot_triples(spots.mm, lines, table.low, table.high, prior)
+    triples, distances = spot_triples(spots.mm, lines, table.low, table.high, prior)
     stripes = _Stripes.of(spots.mm)
     pieces = []
-    for start in range(0, max(len(triples), 1), _PIECE):
-        piece = triples[start : start + _PIECE]
-        seeds = solver.solve(spots.mm[piece], table, cells)
-        own_spots = piece[seeds.triples]
-        counts = np.ones(len(own_spots), dtype=bool)
+    for start in range(0, max(triples.shape[1], 1), _PIECE):
+        part = slice(start, start + _PIECE)
+        seeds = solver.solve(distances[:, part], table, cells)
+        own_spots = triples[:, part][:, seeds.triples]
+        counts = np.ones(len(seeds.triples), dtype=bool)
         if cells is not None:
-            turned = prior.angles(solver.poses(seeds.lambdas, spots.mm[own_spots])[0])
+            turned = prior.angles(solver.poses(seeds.lambdas, spots.mm[own_spots.T])[0])
             near = turned <= prior.seed_angle
             counts = turned[near] <= prior.max_rotation
-            own_spots, seeds = own_spots[near], seeds.take(near)
+            own_spots, seeds = own_spots[:, near], seeds.take(near)
         predicted = _predict(spots, frame, solver, others, own_spots, seeds)
         visible = np.bincount(predicted.visible[counts & predicted.upright], minlength=len(others) + 1)
         hits = _hits(spots, stripes, predicted, own_spots, others, prior)
@@ -118,27 +120,27 @@ def search_seeds(
     return _merged(pieces)
 
 
-def spot_triples(mm: Array, lines: list[int], low: Array, high: Array, prior: Prior) -> NDArray[np.intp]:
-    """Rows (t, 3) of distinct spots (s, 2) mm that three rods can have, not nearly collinear.
+def spot_triples(
+    mm: Array, lines: list[int], low: Array, high: Array, prior: Prior
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Rows (3, t) of distinct spots (s, 2) mm that three rods can have, and their distances (3, t) mm.
 
-    low, high: (3,) mm, bounds of the three distances, in the order of PAIRS.
+    low, high: (3,) mm, bounds of the distances; distances and bounds are in the order of PAIRS.
     """
     x, y = mm[:, 0][:, None] - mm[:, 0], mm[:, 1][:, None] - mm[:, 1]
     distance = np.sqrt(x * x + y * y)
     allowed = []
     for row, (a, b) in enumerate(PAIRS):
-        pair = (distance >= low[row]) & (distance <= high[row])
-        np.fill_diagonal(pair, False)
+        pair = (distance >= max(low[row], _LEAST_DISTANCE_MM)) & (distance <= high[row])
         if prior.spots_of_line is not None:
             pair &= prior.spots_of_line[lines[a]][:, None] & prior.spots_of_line[lines[b]]
         allowed.append(pair)
     first, second = np.nonzero(allowed[0])
-    pair_row, third = np.nonzero(allowed[1][first] & allowed[2][second])
-    first, second = first[pair_row], second[pair_row]
-    twice_area = np.abs(x[second, first] * y[third, first] - y[second, first] * x[third, first])
-    longest = np.maximum(np.maximum(distance[first, second], distance[first, third]), distance[second, third])
-    spread = twice_area > _LEAST_FLATNESS * longest * longest
-    return np.stack([first[spread], second[spread], third[spread]], axis=1)
+    row, third = np.nonzero(allowed[1][first] & allowed[2][second])
+    first, second = first[row], second[row]
+    flat, count = distance.astype(np.float32).ravel(), len(mm)
+    pairs = (first * count + second, first * count + third, second * count + third)
+    return np.stack([first, second, third]), np.stack([flat[pair] for pair in pairs])
 
 
 class _Stripes(NamedTuple):
@@ -168,7 +170,7 @@ class _Stripes(NamedTuple):
 
 
 class _Prediction(NamedTuple):
-    """Where m seeds have the slice cut k further rods; arrays are (k, m).
+    """Where m seeds have the slice cut k further rods; arrays are (k, m) where nothing else is said.
 
     x, y: mm in the slice; xx, yy, xy: their covariance, mm^2, with the noise of the spot that is looked for; on_rod:
     whether the cut may lie on the rod. visible (m,): how many rods the seed has the slice cut; upright (m,): whether
@@ -205,7 +207,7 @@ def _predict(
     squared = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
     # Dual to the sides: a vector's components along u and v are its products with these.
     dual_u, dual_v = _cross(v, normal) / squared, _cross(normal, u) / squared
-    corner_x, corner_y = np.ascontiguousarray(spots.mm[own_spots].transpose(2, 1, 0))
+    corner_x, corner_y = spots.mm[:, 0][own_spots], spots.mm[:, 1][own_spots]
     ax, ay = corner_x[1] - corner_x[0], corner_y[1] - corner_y[0]
     bx, by = corner_x[2] - corner_x[0], corner_y[2] - corner_y[0]
     unit = np.copysign(1.0 / np.sqrt(squared), ax * by - ay * bx)
@@ -243,6 +245,8 @@ def _predict(
         upright = np.abs(to_z) >= LEAST_COSINE
         visible = ((lambdas >= low) & (lambdas <= high) & upright).sum(axis=0)
         on_rod = (lambdas >= low - slide) & (lambdas <= high + slide)
+    longest = np.maximum((u**2).sum(axis=0), (v**2).sum(axis=0))
+    on_rod &= squared > (_LEAST_FLATNESS * longest) ** 2
     # A seed that leans its own rods too far is not one that is sought, though it may lead to one.
     own_upright = np.abs(own_z).min(axis=0) >= LEAST_COSINE
     x = corner_x[0] + second * ax + third * bx
@@ -291,8 +295,8 @@ def _hits(
     off_x = spots.mm[spot, 0] - x[row]
     area = xx[row] * yy[row] - xy[row] ** 2
     squared = yy[row] * off_x**2 + xx[row] * off_y**2 - 2 * xy[row] * off_x * off_y
-    other, seed = np.divmod(chosen[row], max(len(own_spots), 1))
-    inside = (squared <= _SEED_GATE * area) & (own_spots[seed] != spot[:, None]).all(axis=1)
+    other, seed = np.divmod(chosen[row], max(own_spots.shape[1], 1))
+    inside = (squared <= _SEED_GATE * area) & (own_spots[:, seed] != spot).all(axis=0)
     if prior.spots_of_line is not None:
         inside &= prior.spots_of_line[others[other], spot]
     return _Hits(seed[inside], other[inside], spot[inside], area[inside], squared[inside] / area[inside])
@@ -310,7 +314,7 @@ def _kept(
     min_inliers: int,
 ) -> SeedSearch:
     """The seeds that hit enough rods, with their hits in order."""
-    gate = np.full((len(own_spots), len(others)), np.inf)
+    gate = np.full((own_spots.shape[1], len(others)), np.inf)
     gate[hits.seed, hits.other] = hits.area
     reach = 3 + np.isfinite(gate).sum(axis=1)
     rows = np.flatnonzero(reach >= min_inliers)
@@ -318,12 +322,12 @@ def _kept(
     hit_seed, hit_line = np.searchsorted(rows, hits.seed), others[hits.other]
     order = np.argsort(np.argsort(gate[rows], axis=1, kind="stable"), axis=1, kind="stable")
     spot_of_line = np.full((len(rows), len(frame)), UNMATCHED)
-    spot_of_line[:, list(solver.lines)] = own_spots[rows]
+    spot_of_line[:, list(solver.lines)] = own_spots[:, rows].T
     nearest_hits = spot_of_line.copy()
     farthest_first = np.argsort(-hits.squared, kind="stable")  # so that the nearest is written last
     nearest_hits[hit_seed[farthest_first], hit_line[farthest_first]] = hits.spot[farthest_first]
     return SeedSearch(
-        *solver.poses(seeds.lambdas[rows], spots.mm[own_spots[rows]]),
+        *solver.poses(seeds.lambdas[rows], spots.mm[own_spots[:, rows].T]),
         spot_of_line,
         hit_seed,
         hit_line,
