@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammaincc
@@ -20,7 +19,7 @@ from stereoreg_ros.geometry.projection import point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.matching import maurin2009, three_line
 from stereoreg_ros.matching.consensus import Spots
-from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
@@ -33,7 +32,6 @@ _MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
 _DEGENERATE_ROTATION_DEG = 10.0
 # Probabilities of a residual as large by the stated noise alone: less than these, and it is not the noise.
 _IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
-_LEAST_AREA_MM2 = 100.0
 # Standard deviations beyond which a pose is accepted with a caution.
 _WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 1.0, 1.0
 
@@ -102,12 +100,12 @@ def register_spots(
     spots = _prepare(spots_px, scale, options.spot_noise_px, slice_area_mm2)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
-    hypotheses = _MATCHERS[options.matcher](spots, frame, prior, options)
-    estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in hypotheses)
+    found = _MATCHERS[options.matcher](spots, frame, prior, options)
+    estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in found.hypotheses)
+    if found.given_up:
+        return refuse("no_consensus", f"the search among {count} spots was {found.given_up}", estimates)
     if not estimates:
-        return refuse(
-            "no_consensus", f"no pose puts {options.min_inliers} of the {len(frame)} rods on any of the {count} spots"
-        )
+        return refuse("no_consensus", _describe_nothing(found, len(frame), count, options))
     best = estimates[0]
     if best.log10_false_alarms > options.max_log10_false_alarms:
         return refuse(
@@ -161,13 +159,11 @@ def _area_mm2(ct_slice: Slice) -> float:
 
 def _prepare(spots_px: Array, scale: PixelScale, noise_px: float, slice_area_mm2: float | None) -> Spots:
     mm = scale.to_mm(spots_px)
-    hull = cv2.convexHull(mm.astype(np.float32))
     return Spots(
         mm=mm,
         whitening=scale.inverse_matrix / noise_px,
         sigma_mm=noise_px * max(scale.sx, scale.sy),
         variance_mm2=noise_px**2 * scale.sx * scale.sy,
-        hull_area_mm2=max(float(cv2.contourArea(hull)), _LEAST_AREA_MM2),
         slice_area_mm2=slice_area_mm2,
     )
 
@@ -198,6 +194,14 @@ def _covariance(information: Array) -> Array:
     values, vectors = np.linalg.eigh(information)
     covariance: Array = (vectors / np.maximum(values, 1e-12)) @ vectors.T
     return covariance
+
+
+def _describe_nothing(found: Found, lines: int, spots: int, options: RegistrationOptions) -> str:
+    nothing = f"no pose puts {min(found.least_rods, lines)} of the {lines} rods on any of the {spots} spots"
+    if found.least_rods <= options.min_inliers:
+        return nothing
+    fewer = f"{found.least_rods - 1} rods could hardly be told from chance among so many spots"
+    return f"{nothing}, and {fewer}" if found.least_rods <= lines else fewer
 
 
 def _describe_ambiguity(estimates: tuple[PoseEstimate, ...]) -> str:

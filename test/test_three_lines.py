@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from frames import random_frame, random_slice_from_frame
+from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
@@ -12,7 +15,7 @@ from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_ex
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
-from stereoreg_ros.solvers.three_lines import PAIRS, Seeds, ThreeLineSolver
+from stereoreg_ros.solvers.three_lines import PAIRS, ThreeLineSolver
 
 TOLERANCE = 0.3
 SLACK = 1.0
@@ -23,6 +26,25 @@ def distances(points: Array) -> Array:
     """Of the pairs of points (..., 3, k), in the order of PAIRS."""
     between: Array = np.stack([np.linalg.norm(points[..., a, :] - points[..., b, :], axis=-1) for a, b in PAIRS], -1)
     return between
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Seeds of triples of spots, with their poses."""
+
+    triples: NDArray[np.intp]
+    lambdas: Array
+    lambda_covariance: Array
+    rotations: Array
+    translations: Array
+
+
+def solve(frame: Frame, spots_mm: Array, tolerance: float = TOLERANCE, lines: tuple[int, int, int] = ALL) -> Solved:
+    """All poses for triples of spots (t, 3, 2)."""
+    solver = ThreeLineSolver(frame, lines, tolerance, SLACK)
+    seeds = solver.solve(distances(spots_mm).T, solver.table(0, len(frame)))
+    poses = solver.poses(seeds.lambdas, spots_mm[seeds.triples])
+    return Solved(seeds.triples, seeds.lambdas, seeds.lambda_covariance, *poses)
 
 
 def conditioning(frame: Frame, lambdas: Array) -> float:
@@ -47,7 +69,7 @@ def scenes(seed: int, count: int) -> list[tuple[Frame, Pose, Array, Array]]:
     return drawn
 
 
-def polished(frame: Frame, seeds: Seeds, spots_mm: Array) -> Refined:
+def polished(frame: Frame, seeds: Solved, spots_mm: Array) -> Refined:
     m = len(seeds.triples)
     used = np.ones((m, 3), dtype=bool)
     found = refine(frame, seeds.rotations, seeds.translations, np.tile(spots_mm, (m, 1, 1)), used, 100 * np.eye(2), 60)
@@ -67,7 +89,7 @@ class TestExactSpots:
         for frame, true, spots, lambdas in scenes(1, 250):
             if conditioning(frame, lambdas) < 0.1:
                 continue
-            seeds = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK).solve(spots[None])
+            seeds = solve(frame, spots[None])
             apart = np.linalg.norm(seeds.translations - true.translation, axis=1)
             apart += 30 * rotation_angle(seeds.rotations @ true.rotation.T)
             best = int(apart.argmin())
@@ -79,7 +101,7 @@ class TestExactSpots:
     def test_near_double_roots_it_is_within_reach_of_the_refinement(self) -> None:
         reached = []
         for frame, true, spots, _ in scenes(2, 80):
-            found = polished(frame, ThreeLineSolver(frame, ALL, TOLERANCE, SLACK).solve(spots[None]), spots)
+            found = polished(frame, solve(frame, spots[None]), spots)
             apart = np.linalg.norm(found.translations - true.translation, axis=1)
             reached.append(bool((apart < 1e-2).any()))
         assert np.mean(reached) >= 0.95
@@ -89,8 +111,7 @@ class TestExactSpots:
         for frame, _, spots, _ in scenes(3, 60):
             if flatness(spots) < 0.1:
                 continue  # a side that is wrong by the tolerance bends a flat triangle by far more
-            solver = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK)
-            seeds = solver.solve(spots[None])
+            seeds = solve(frame, spots[None])
             found += len(seeds.triples)
             points = frame.points(list(ALL), seeds.lambdas)
             # The distances' error to first order is held against the tolerance, so a little over it is right.
@@ -111,7 +132,7 @@ class TestExactSpots:
     def test_no_more_than_eight_distinct_solutions(self) -> None:
         most = 0
         for frame, _, spots, _ in scenes(4, 50):
-            found = polished(frame, ThreeLineSolver(frame, ALL, TOLERANCE, SLACK).solve(spots[None]), spots)
+            found = polished(frame, solve(frame, spots[None]), spots)
             distinct: list[Array] = []
             for pose in np.hstack([found.translations, 20 * found.rotations.reshape(-1, 9)]):
                 if all(np.linalg.norm(pose - other) > 0.05 for other in distinct):
@@ -124,16 +145,12 @@ class TestExactSpots:
         (frame, _, first, _), *_ = scenes(5, 1)
         rng = np.random.default_rng(6)
         spots = np.stack([first, first + rng.normal(0, 3, (3, 2)), first + 500.0, first * 30])
-        solver = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK)
-        together = solver.solve(spots)
+        together = solve(frame, spots)
         assert set(together.triples.tolist()) >= {0, 2}
         assert 3 not in together.triples
         for k in range(len(spots)):
-            alone = solver.solve(spots[k : k + 1])
+            alone = solve(frame, spots[k : k + 1])
             np.testing.assert_allclose(together.lambdas[together.triples == k], alone.lambdas, atol=1e-12)
-        chosen = together.take(together.triples == 2)
-        np.testing.assert_array_equal(chosen.triples, 2)
-        assert len(chosen.rotations) == len(chosen.translations) == len(chosen.lambda_covariance) == len(chosen.triples)
 
     def test_rods_by_their_rows(self) -> None:
         rng = np.random.default_rng(7)
@@ -141,7 +158,7 @@ class TestExactSpots:
         true = random_slice_from_frame(rng, frame)
         lines = (4, 0, 5)
         spots = cut(frame, true.rotation, true.translation).points_mm[list(lines)]
-        seeds = ThreeLineSolver(frame, lines, TOLERANCE, SLACK).solve(spots[None])
+        seeds = solve(frame, spots[None], lines=lines)
         assert np.linalg.norm(seeds.translations - true.translation, axis=1).min() < 0.05
 
 
@@ -157,14 +174,13 @@ class TestParallelPairs:
         rng = np.random.default_rng(8)
         scale = PixelScale(0.5, 0.5)
         whitening = scale.inverse_matrix / 0.3
-        solver = ThreeLineSolver(frame, lines, 0.95, SLACK)
         reached = []
         for _ in range(20):
             axis = rng.normal(size=3)
             tilt = rotation_exp(np.radians(tilt_deg) * axis / np.linalg.norm(axis))
             true = Pose(tilt, tilt @ np.array([-95.0, 60.0, rng.uniform(30, 90)]) + [120.0, 120.0, 0.0])
             spots = cut(frame, true.rotation, true.translation).points_mm + scale.to_mm(rng.normal(0, 0.3, (6, 2)))
-            seeds = solver.solve(spots[None, list(lines)])
+            seeds = solve(frame, spots[None, list(lines)], 0.95, lines)
             m = len(seeds.triples)
             tiled, used = np.tile(spots, (m + 1, 1, 1)), np.ones((m + 1, 6), dtype=bool)
             rotations = np.concatenate([seeds.rotations, true.rotation[None]])
@@ -178,7 +194,7 @@ class TestParallelPairs:
         true = Pose(np.eye(3), np.array([20.0, 180.0, 60.0]))
         lines = [0, 1, 3]
         spots = cut(frame, true.rotation, true.translation).points_mm[lines]
-        seeds = ThreeLineSolver(frame, (0, 1, 3), 0.8, SLACK).solve(spots[None])
+        seeds = solve(frame, spots[None], 0.8, (0, 1, 3))
         deviation = np.sqrt(np.linalg.eigvalsh(seeds.lambda_covariance)[:, -1])
         sigma = 0.8 / 4
         longest = distances(spots).max()
@@ -190,14 +206,13 @@ class TestParallelPairs:
 class TestNothing:
     def test_impossible_distances(self) -> None:
         (frame, _, spots, _), *_ = scenes(9, 1)
-        solver = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK)
         middle = spots.mean(axis=0)
         for factor in (20.0, 1e-3):
-            assert len(solver.solve((middle + factor * (spots - middle))[None]).triples) == 0
+            assert len(solve(frame, (middle + factor * (spots - middle))[None]).triples) == 0
 
     def test_no_triples(self) -> None:
         (frame, _, _, _), *_ = scenes(10, 1)
-        seeds = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK).solve(np.empty((0, 3, 2)))
+        seeds = solve(frame, np.empty((0, 3, 2)))
         assert seeds.triples.shape == (0,)
         assert seeds.rotations.shape == (0, 3, 3)
         assert seeds.translations.shape == (0, 3)
@@ -206,7 +221,37 @@ class TestNothing:
 
     def test_possible_distances_are_within_the_stated_bounds(self) -> None:
         for frame, _, spots, _ in scenes(11, 40):
-            solver = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK)
+            table = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK).table(0, 3)
             between = distances(spots)
-            assert (between >= solver.distance_low).all()
-            assert (between <= solver.distance_high).all()
+            assert (between >= table.low).all()
+            assert (between <= table.high).all()
+
+
+class TestCells:
+    """What is said of a cell holds for the slices through it."""
+
+    def test_the_table_of_the_rods_cut_holds_the_solution(self) -> None:
+        rng = np.random.default_rng(12)
+        found = []
+        for _ in range(60):
+            frame = random_frame(rng, 6)
+            true = random_slice_from_frame(rng, frame, max_tilt_deg=40.0)
+            cuts = cut(frame, true.rotation, true.translation)
+            assert cuts.inside.all()
+            solver = ThreeLineSolver(frame, (0, 2, 5), TOLERANCE, SLACK, 0.2)
+            spots = cuts.points_mm[[0, 2, 5]]
+            # All six rods are cut, and the slice is not among those that cut fewer.
+            seeds = solver.solve(distances(spots)[:, None], solver.table(6, 6))
+            found.append(bool((np.abs(seeds.lambdas - cuts.lambdas[[0, 2, 5]]).max(axis=1) < 0.5).any()))
+            near = solver.cells_near(true.rotation[2], np.radians(5.0))
+            prior = solver.solve(distances(spots)[:, None], solver.table(6, 6), near)
+            kept = bool((np.abs(prior.lambdas - cuts.lambdas[[0, 2, 5]]).max(axis=1) < 0.5).any())
+            assert kept == found[-1]
+            assert near.mean() < 0.5
+        assert np.mean(found) >= 0.98
+
+    def test_cells_of_leaning_rods_are_in_no_table_of_three(self) -> None:
+        frame = random_frame(np.random.default_rng(13), 4)
+        loose, strict = (ThreeLineSolver(frame, ALL, TOLERANCE, SLACK, least) for least in (0.0, 0.9))
+        assert (strict.rods_cut == 0).sum() > (loose.rods_cut == 0).sum()
+        assert (strict.rods_cut <= loose.rods_cut).all()

@@ -24,6 +24,12 @@ def skew(vectors: Array) -> Array:
     return matrices.reshape(*vectors.shape, 3)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross products a x b of vectors (..., 3); numpy's own takes several times as long for few vectors."""
+    products: Array = (skew(a) @ b[..., None])[..., 0]
+    return products
+
+
 def rotation_exp(rotation_vectors: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians, by their quaternions."""
     squared = np.einsum("...i,...i->...", rotation_vectors, rotation_vectors)[..., None, None]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, Pose
+from stereoreg_ros.geometry.pose import Array, Pose, cross
 from stereoreg_ros.geometry.slice import PixelScale
 
 # Below this cosine between rod and slice normal the cut runs away along the rod: treated as no cut at all.
@@ -95,6 +95,6 @@ def point_line_distances(frame: Frame, lines: NDArray[np.intp], slice_from_frame
     in_slice = np.zeros((len(points_mm), 3))
     in_slice[:, :2] = points_mm
     in_frame = slice_from_frame.inverse() @ in_slice
-    offset = np.cross(frame.directions[lines], in_frame) - frame.moments[lines]
+    offset = cross(frame.directions[lines], in_frame) - frame.moments[lines]
     distances: Array = np.linalg.norm(offset, axis=-1)
     return distances

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,8 @@ class Hypothesis:
 
     rotation (3, 3), translation (3,) mm: slice_from_frame, refined by maximum likelihood; spot_of_line (n,): for each
     rod the row of its spot, or UNMATCHED; chi_square: squared residuals over the noise; information (6, 6): inverse
-    covariance of the pose (see `solvers.maximum_likelihood.Refined`); log10_false_alarms: see `matching.significance`.
+    covariance of the pose (see `solvers.maximum_likelihood.Refined`); missing: number of rods that the slice must cut
+    among the spots, and that have none; log10_false_alarms: see `matching.significance`.
     """
 
     rotation: Array
@@ -26,9 +28,23 @@ class Hypothesis:
     spot_of_line: NDArray[np.intp]
     chi_square: float
     information: Array
-    log10_false_alarms: float
+    missing: int
+    log10_false_alarms: float = math.nan
 
     @property
     def inliers(self) -> int:
         """Number of rods with a spot."""
         return int((self.spot_of_line != UNMATCHED).sum())
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search came to.
+
+    hypotheses: the explanations that the best one does not rule out, best first; none where there is none.
+    least_rods: explanations of fewer rods were not sought. given_up: why the search was ended early, else empty.
+    """
+
+    hypotheses: list[Hypothesis]
+    least_rods: int
+    given_up: str = ""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.matching.consensus import Spots, distinct, judged
-from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.consensus import Spots, count_missing, distinct, judged
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION, POSE_RANK, assemble, condition_number
@@ -106,7 +106,7 @@ def search(
     return Search(ranked, drawn, planned, time.perf_counter() - started)
 
 
-def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> list[Hypothesis]:
+def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> Found:
     """Explanations by the paper's search, refined and judged, best first; none where no sample qualified.
 
     Same form as `matching.three_line.match`. Being random, it may miss what is there.
@@ -115,7 +115,7 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
     starts = [(one.frame_from_slice.inverse(), _one_to_one(one, frame, spots.mm)) for one in result.qualified]
     starts = [start for start in starts if (start[1] != UNMATCHED).sum() >= options.min_inliers]
     if not starts:
-        return []
+        return Found([], SAMPLE + 1)
     spot_of_line = np.array([assigned for _, assigned in starts])
     refined = refine(
         frame,
@@ -126,6 +126,7 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
         spots.whitening,
     )
     kept = refined.converged & (prior.angles(refined.rotations) <= prior.max_rotation)
+    missing = count_missing(spots, frame, refined.cuts, spot_of_line)
     found = [
         Hypothesis(
             refined.rotations[i],
@@ -133,14 +134,14 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
             spot_of_line[i],
             float(refined.chi_square[i]),
             refined.information[i],
-            math.nan,
+            int(missing[i]),
         )
         for i in np.flatnonzero(kept)
     ]
     # Every sample drawn is a pose that was tried, with any choice of the further rods.
     tried = np.zeros(len(frame) - 2, dtype=np.int64)
     tried[-1] = result.samples
-    return judged(distinct(found, spots), spots, frame, tried)
+    return Found(judged(distinct(found, spots.gain(frame)), spots, frame, tried), SAMPLE + 1)
 
 
 def _has_collinear_triple(four: Array, smallest_sine: float) -> bool:

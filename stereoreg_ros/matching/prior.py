@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +28,19 @@ class Prior:
     @property
     def normal(self) -> Array:
         """The slice's normal in the frame, (3,), at the rough rotation."""
-        return self.rotation[2]
+        normal: Array = self.rotation[2]
+        return normal
 
     @property
     def seed_angle(self) -> float:
         """Greatest angle of a seed, which is not yet refined, rad."""
         return self.max_rotation + _SEED_SLACK
 
+    def only(self, rows: NDArray[np.intp]) -> Prior:
+        """The same for some of the spots."""
+        allowed = None if self.spots_of_line is None else self.spots_of_line[:, rows]
+        return replace(self, spots_of_line=allowed)
+
     def angles(self, rotations: Array) -> Array:
-        """Angles (m,) in rad of rotations (m, 3, 3) from the rough one."""
+        """Angles (...) in rad of rotations (..., 3, 3) from the rough one."""
         return rotation_angle(rotations @ self.rotation.T)

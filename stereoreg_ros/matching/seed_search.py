@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.matching.consensus import GATE, Spots
-from stereoreg_ros.matching.hypothesis import UNMATCHED
+from stereoreg_ros.matching.consensus import GATE, MISSING_COST, SURE_MM, Spots
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.significance import LEAST_COSINE
 from stereoreg_ros.solvers.three_lines import PAIRS, Seeds, ThreeLineSolver
@@ -23,6 +23,10 @@ _SEED_GATE = 2 * GATE
 _LEAST_FLATNESS = 0.03
 # Two spots nearer than this are one spot found twice.
 _LEAST_DISTANCE_MM = 1e-3
+# What the first order may leave out of a squared distance.
+_FIRST_ORDER_SLACK = 10.0
+# A seed so near an explanation (mm, and the rotation matrix's elements) leads to it.
+_SAME_MM, _SAME_ROTATION = 5.0, 0.1
 # Triples of spots looked at in one piece: what belongs to it then stays in the processor's cache.
 _PIECE = 12000
 # Stripes of the slice in which spots are looked up.
@@ -51,9 +55,11 @@ class SeedSearch(NamedTuple):
 
     rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame. spot_of_line: (m, n), the three spots of each seed.
     hit_seed, hit_line, hit_spot: (h,), a further rod whose prediction a spot is near; hit_rank: (h,), 0 for the rod of
-    that seed that is predicted the sharpest, and so on; nearest_hits: (m, n), spot_of_line with the nearest hit of
-    every rod. reach: (m,), three and the number of further rods that are hit: no consensus of the seed can have more.
-    seeds_by_visible: at v, how many seeds, whatever they hit, have the slice cut v further rods and lie within the prior.
+    that seed that is predicted the sharpest, and so on; hit_squared: (h,), squared distance in standard deviations.
+    nearest_hits: (m, n), spot_of_line with the nearest hit of every rod; nearest_squared: (m, k), its squared distance
+    for each further rod. reach: (m,), three and the number of further rods that are hit: no consensus has more.
+    owed: (m,), rods that the slice must cut among the spots, and that are not hit. seeds_by_visible: at v, how many
+    seeds within the prior, whatever they hit, have the slice cut v further rods. triples: how many were looked at.
     """
 
     rotations: Array
@@ -63,19 +69,35 @@ class SeedSearch(NamedTuple):
     hit_line: NDArray[np.intp]
     hit_spot: NDArray[np.intp]
     hit_rank: NDArray[np.intp]
+    hit_squared: Array
     nearest_hits: NDArray[np.intp]
+    nearest_squared: Array
     reach: NDArray[np.intp]
+    owed: NDArray[np.intp]
     seeds_by_visible: NDArray[np.int64]
+    triples: int
 
-    def reaching(self, level: int) -> Starts:
+    def reaching(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Starts:
         """Starts that a consensus of `level` rods needs besides those of the levels above.
 
         A consensus of `level` misses reach - level of the rods that the seed's predictions hit. So it holds one of the
         reach - level + 1 sharpest of them; the levels above have started from all of these but the last. Each hit of
         that rod gives two starts: with it alone, and with the nearest hit of every other rod too, as four matches leave
         the tilt of parallel rods so open that the fifth rod would not be where the first order has it.
+
+        most_chi_square: what a consensus may have at most, in chi-square and the cost of missing rods together; known:
+        explanations that are not sought again.
         """
-        chosen = np.flatnonzero(self.hit_rank == self.reach[self.hit_seed] - level)
+        # Each match alone, given the seed, brings its squared distance to chi-square, to first order.
+        most_squared = most_chi_square + _FIRST_ORDER_SLACK
+        wanted = (self.nearest_squared <= most_squared).sum(axis=1) >= level - 3
+        wanted &= 2 * MISSING_COST * self.owed <= most_chi_square
+        wanted &= ~self._leads_to(known)
+        chosen = np.flatnonzero(
+            (self.hit_rank == self.reach[self.hit_seed] - level)
+            & (self.hit_squared <= most_squared)
+            & wanted[self.hit_seed]
+        )
         seed = self.hit_seed[chosen]
         spot_of_line = self.spot_of_line[seed]
         spot_of_line[np.arange(len(chosen)), self.hit_line[chosen]] = self.hit_spot[chosen]
@@ -88,17 +110,34 @@ class SeedSearch(NamedTuple):
         rows = np.concatenate([seed, seed[more]])
         return Starts(self.rotations[rows], self.translations[rows], np.concatenate([spot_of_line, full[more]]), rows)
 
+    def _leads_to(self, known: list[Hypothesis]) -> NDArray[np.bool_]:
+        """Which seeds are near one of these explanations, and give no rod another spot."""
+        leads = np.zeros(len(self.reach), dtype=bool)
+        for hypothesis in known:
+            same = ((self.spot_of_line == hypothesis.spot_of_line) | (self.spot_of_line == UNMATCHED)).all(axis=1)
+            same &= np.linalg.norm(self.translations - hypothesis.translation, axis=1) < _SAME_MM
+            same &= np.abs(self.rotations - hypothesis.rotation).max(axis=(1, 2)) < _SAME_ROTATION
+            leads |= same
+        return leads
+
 
 def search_seeds(
-    spots: Spots, frame: Frame, solver: ThreeLineSolver, rods_cut: int, prior: Prior, min_inliers: int
+    spots: Spots,
+    frame: Frame,
+    solver: ThreeLineSolver,
+    rods_cut: tuple[int, int],
+    prior: Prior,
+    min_inliers: int,
 ) -> SeedSearch:
-    """The seeds of the solver's rods where a slice may cut `rods_cut` rods, within the prior, and what they hit.
+    """The seeds of the solver's rods within the prior, and what they hit.
+
+    rods_cut: only where a slice may cut so many rods, at least and at most.
 
     Only seeds that hit enough for a consensus of `min_inliers` rods are kept.
     """
     lines = list(solver.lines)
     others = np.array([line for line in range(len(frame)) if line not in lines])
-    table = solver.table(rods_cut)
+    table = solver.table(*rods_cut)
     cells = None if prior.max_rotation >= np.pi else solver.cells_near(prior.normal, prior.seed_angle)
     triples, distances = spot_triples(spots.mm, lines, table.low, table.high, prior)
     stripes = _Stripes.of(spots.mm)
@@ -116,7 +155,21 @@ def search_seeds(
         predicted = _predict(spots, frame, solver, others, own_spots, seeds)
         visible = np.bincount(predicted.visible[counts & predicted.upright], minlength=len(others) + 1)
         hits = _hits(spots, stripes, predicted, own_spots, others, prior)
-        pieces.append(_kept(spots, frame, solver, others, own_spots, seeds, hits, visible, min_inliers))
+        pieces.append(
+            _kept(
+                spots,
+                frame,
+                solver,
+                others,
+                own_spots,
+                seeds,
+                predicted.sure,
+                hits,
+                visible,
+                distances[:, part].shape[1],
+                min_inliers,
+            )
+        )
     return _merged(pieces)
 
 
@@ -136,8 +189,8 @@ def spot_triples(
             pair &= prior.spots_of_line[lines[a]][:, None] & prior.spots_of_line[lines[b]]
         allowed.append(pair)
     first, second = np.nonzero(allowed[0])
-    row, third = np.nonzero(allowed[1][first] & allowed[2][second])
-    first, second = first[row], second[row]
+    chosen, third = np.nonzero(allowed[1][first] & allowed[2][second])
+    first, second = first[chosen], second[chosen]
     flat, count = distance.astype(np.float32).ravel(), len(mm)
     pairs = (first * count + second, first * count + third, second * count + third)
     return np.stack([first, second, third]), np.stack([flat[pair] for pair in pairs])
@@ -173,8 +226,8 @@ class _Prediction(NamedTuple):
     """Where m seeds have the slice cut k further rods; arrays are (k, m) where nothing else is said.
 
     x, y: mm in the slice; xx, yy, xy: their covariance, mm^2, with the noise of the spot that is looked for; on_rod:
-    whether the cut may lie on the rod. visible (m,): how many rods the seed has the slice cut; upright (m,): whether
-    it has its own rods leave the slice steeply enough to count.
+    whether the cut may lie on the rod; sure: whether it must, and among the spots. visible (m,): how many rods the seed
+    has the slice cut; upright (m,): whether it has its own rods leave the slice steeply enough to count.
     """
 
     x: Array
@@ -183,6 +236,7 @@ class _Prediction(NamedTuple):
     yy: Array
     xy: Array
     on_rod: NDArray[np.bool_]
+    sure: NDArray[np.bool_]
     visible: NDArray[np.intp]
     upright: NDArray[np.bool_]
 
@@ -245,13 +299,16 @@ def _predict(
         upright = np.abs(to_z) >= LEAST_COSINE
         visible = ((lambdas >= low) & (lambdas <= high) & upright).sum(axis=0)
         on_rod = (lambdas >= low - slide) & (lambdas <= high + slide)
-    longest = np.maximum((u**2).sum(axis=0), (v**2).sum(axis=0))
-    on_rod &= squared > (_LEAST_FLATNESS * longest) ** 2
+        slide += END_SLACK_MM + SURE_MM
+        sure = (lambdas >= low + slide) & (lambdas <= high - slide) & upright
+    longest = np.maximum(ax**2 + ay**2, bx**2 + by**2)
+    on_rod &= np.abs(ax * by - ay * bx) > _LEAST_FLATNESS * longest
     # A seed that leans its own rods too far is not one that is sought, though it may lead to one.
     own_upright = np.abs(own_z).min(axis=0) >= LEAST_COSINE
     x = corner_x[0] + second * ax + third * bx
     y = corner_y[0] + second * ay + third * by
-    return _Prediction(x, y, xx, yy, xy, on_rod, visible, own_upright)
+    sure &= spots.surround(np.stack([x, y], axis=-1))
+    return _Prediction(x, y, xx, yy, xy, on_rod, sure, visible, own_upright)
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -271,7 +328,7 @@ class _Hits(NamedTuple):
     squared: Array
 
     def take(self, rows: NDArray[np.intp]) -> _Hits:
-        return _Hits(*(part[rows] for part in self))
+        return _Hits(self.seed[rows], self.other[rows], self.spot[rows], self.area[rows], self.squared[rows])
 
 
 def _hits(
@@ -309,14 +366,17 @@ def _kept(
     others: NDArray[np.intp],
     own_spots: NDArray[np.intp],
     seeds: Seeds,
+    sure: NDArray[np.bool_],
     hits: _Hits,
     seeds_by_visible: NDArray[np.intp],
+    triples: int,
     min_inliers: int,
 ) -> SeedSearch:
     """The seeds that hit enough rods, with their hits in order."""
     gate = np.full((own_spots.shape[1], len(others)), np.inf)
     gate[hits.seed, hits.other] = hits.area
-    reach = 3 + np.isfinite(gate).sum(axis=1)
+    is_hit = np.isfinite(gate)
+    reach = 3 + is_hit.sum(axis=1)
     rows = np.flatnonzero(reach >= min_inliers)
     hits = hits.take(np.flatnonzero(reach[hits.seed] >= min_inliers))
     hit_seed, hit_line = np.searchsorted(rows, hits.seed), others[hits.other]
@@ -326,6 +386,8 @@ def _kept(
     nearest_hits = spot_of_line.copy()
     farthest_first = np.argsort(-hits.squared, kind="stable")  # so that the nearest is written last
     nearest_hits[hit_seed[farthest_first], hit_line[farthest_first]] = hits.spot[farthest_first]
+    nearest_squared = np.full((len(rows), len(others)), np.inf)
+    nearest_squared[hit_seed[farthest_first], hits.other[farthest_first]] = hits.squared[farthest_first]
     return SeedSearch(
         *solver.poses(seeds.lambdas[rows], spots.mm[own_spots[:, rows].T]),
         spot_of_line,
@@ -333,18 +395,37 @@ def _kept(
         hit_line,
         hits.spot,
         order[hit_seed, hits.other],
+        hits.squared,
         nearest_hits,
+        nearest_squared,
         reach[rows],
+        (sure.T[rows] & ~is_hit[rows]).sum(axis=1),
         seeds_by_visible.astype(np.int64),
+        triples,
     )
 
 
 def _merged(pieces: list[SeedSearch]) -> SeedSearch:
     if len(pieces) == 1:
         return pieces[0]
-    before = np.cumsum([0, *(len(piece.reach) for piece in pieces[:-1])])
-    numbered = [
-        piece._replace(hit_seed=piece.hit_seed + first) for piece, first in zip(pieces, before.tolist(), strict=True)
-    ]
-    joined = (np.concatenate(parts) for parts in zip(*(piece[:-1] for piece in numbered), strict=True))
-    return SeedSearch(*joined, np.sum([piece.seeds_by_visible for piece in pieces], axis=0))
+    before = np.cumsum([0, *(len(piece.reach) for piece in pieces[:-1])]).tolist()
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(piece, name) for piece in pieces])
+
+    return SeedSearch(
+        joined("rotations"),
+        joined("translations"),
+        joined("spot_of_line"),
+        np.concatenate([piece.hit_seed + first for piece, first in zip(pieces, before, strict=True)]),
+        joined("hit_line"),
+        joined("hit_spot"),
+        joined("hit_rank"),
+        joined("hit_squared"),
+        joined("nearest_hits"),
+        joined("nearest_squared"),
+        joined("reach"),
+        joined("owed"),
+        np.sum([piece.seeds_by_visible for piece in pieces], axis=0),
+        sum(piece.triples for piece in pieces),
+    )

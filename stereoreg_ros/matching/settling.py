@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut_jacobian
-from stereoreg_ros.matching.consensus import GATE, Spots
+from stereoreg_ros.matching.consensus import GATE, Spots, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.seed_search import END_SLACK_MM, Starts
 from stereoreg_ros.matching.significance import LEAST_COSINE
@@ -31,6 +31,7 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
         enough = (assigned != UNMATCHED).sum(axis=1) >= min_inliers
         same = (assigned == spot_of_line).all(axis=1)
         at_rest = same & (refined.converged | (number > 0))
+        missing = count_missing(spots, frame, refined.cuts, assigned)
         settled += [
             Hypothesis(
                 refined.rotations[i],
@@ -38,7 +39,7 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
                 assigned[i],
                 float(refined.chi_square[i]),
                 refined.information[i],
-                np.nan,
+                int(missing[i]),
             )
             for i in np.flatnonzero(enough & at_rest)
         ]

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainc
+from scipy.special import gammainc, gammaincinv
 
 from stereoreg_ros.geometry.pose import Array
 
@@ -30,6 +30,8 @@ _LEAST_AREA_MM2 = 100.0
 # Clutter around the frame that uniform clutter would bring less often than this is taken to be denser there.
 _CROWDED = 0.01
 _FEWEST, _SHARE_OF_FEWEST = 4, 0.01
+# How seldom a true match has a residual as small as that by which a search for one is held to be hopeless.
+_LUCK = 0.01
 
 
 def log10_false_alarms(
@@ -69,18 +71,56 @@ def log10_false_alarms(
     return float((log_chance + log_choices) / math.log(10.0))
 
 
-def clutter_area_mm2(spots_mm: Array, matched: NDArray[np.intp], slice_area_mm2: float | None) -> float:
-    """Area in mm^2 over which the spots (s, 2) mm would be spread if they were everywhere as dense as around the frame.
+def least_log10_false_alarms(
+    inliers: int, lines: int, spots: int, seeds_by_visible: NDArray[np.int64], variance_mm2: float, area_mm2: float
+) -> float:
+    """What log10_false_alarms of a true match of so many rods is hardly ever below: once in a hundred.
 
-    matched: rows of the k spots given to rods. slice_area_mm2: where not known, spots uniform in a rectangle leave a
-    margin of it empty, on average 1 / (s + 1) of each side: it is taken to be that much larger than the box around
-    them. Around the frame (half again as far as the matched spots reach) clutter can be denser than elsewhere: where
-    there are more unmatched spots than uniform ones would be once in a hundred slices, their density is taken.
+    seeds_by_visible: of the seeds found so far; lines: of the frame; the others as in `log10_false_alarms`.
+    """
+    chi_square = 2 * float(gammaincinv(inliers - 3, _LUCK)) if inliers > 3 else 0.0
+    return log10_false_alarms(
+        inliers,
+        spots,
+        choices_of_rods(seeds_by_visible, inliers),
+        chi_square,
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        variance_mm2,
+        area_mm2,
+        share_of(inliers, lines),
+    )
+
+
+def choices_of_rods(seeds_by_visible: NDArray[np.int64], inliers: int) -> int:
+    """Over all seeds, the number of ways to choose the further rods of a match of so many.
+
+    seeds_by_visible: at v, how many seeds have the slice cut v rods besides their own three.
+    """
+    return sum(int(seeds) * math.comb(visible, inliers - 3) for visible, seeds in enumerate(seeds_by_visible))
+
+
+def area_of_uniform_mm2(spots_mm: Array, slice_area_mm2: float | None) -> float:
+    """Area in mm^2 over which uniform spots (s, 2) mm fall: the slice's.
+
+    Where that is not known, spots uniform in a rectangle leave a margin of it empty, on average 1 / (s + 1) of each
+    side: it is taken to be that much larger than the box around them.
     """
     count = len(spots_mm)
     width, height = np.ptp(spots_mm, axis=0)
     box = float(width * height) * ((count + 1) / (count - 1)) ** 2
-    everywhere = max(slice_area_mm2 or box, _LEAST_AREA_MM2)
+    return max(slice_area_mm2 or box, _LEAST_AREA_MM2)
+
+
+def clutter_area_mm2(spots_mm: Array, matched: NDArray[np.intp], slice_area_mm2: float | None) -> float:
+    """Area in mm^2 over which the spots (s, 2) mm would be spread if they were everywhere as dense as around the frame.
+
+    matched: rows of the k spots given to rods; slice_area_mm2: see `area_of_uniform_mm2`.
+    Around the frame (half again as far as the matched spots reach) clutter can be denser than elsewhere: where
+    there are more unmatched spots than uniform ones would be once in a hundred slices, their density is taken.
+    """
+    count = len(spots_mm)
+    everywhere = area_of_uniform_mm2(spots_mm, slice_area_mm2)
     centre = spots_mm[matched].mean(axis=0)
     radius = 1.5 * float(np.linalg.norm(spots_mm[matched] - centre, axis=1).max())
     nearby = int((np.linalg.norm(spots_mm - centre, axis=1) <= radius).sum()) - len(matched)

@@ -7,60 +7,132 @@ to stop, is said here.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.matching.consensus import Spots, distinct, judged
-from stereoreg_ros.matching.hypothesis import Hypothesis
+from stereoreg_ros.matching.consensus import TOLD_APART, Spots, distinct, judged, log10_by_chance, score
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import END_SLACK_MM, SeedSearch, search_seeds
 from stereoreg_ros.matching.settling import settle
-from stereoreg_ros.matching.significance import LEAST_COSINE
+from stereoreg_ros.matching.significance import LEAST_COSINE, area_of_uniform_mm2, least_log10_false_alarms
 from stereoreg_ros.matching.triple_order import triple_order
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.three_lines import ThreeLineSolver
 
 # Hypotheses refined at once: bounds the memory.
 _CHUNK = 4000
+# Triples of spots after which a search is given up: some seconds. Only clutter takes so many.
+_MOST_TRIPLES = 6_000_000
+# Explanations that chance brings less often than this (log10) are not sought beside one that was found.
+_LOG10_RIVALS = -3.0
 
 
-def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> list[Hypothesis]:
-    """All explanations of the spots that the best one does not rule out, best first; none where there is none.
+def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> Found:
+    """All explanations of the spots that the best one does not rule out.
 
     Explanations of all rods are sought first, then of all but one, and so on. At each level every set of so many rods
-    holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots. Once an
-    explanation of so many rods is found, those of fewer are not sought: a rod more is worth more than any residual that
-    passes the gates but a bad one. Complete but for the seeds: of a well-conditioned triple 99.5 % of the poses are
-    found, not all, which other triples mostly make up for.
+    holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots. Where
+    nothing is found, the search ends where so few rods could hardly be told from chance. Where something is found, it
+    goes on as long as an explanation of fewer rods, if it fits well, could come near: among all spots, or, where chance
+    would not bring one, among those of the best explanation, as a twin of the true pose has them. Complete but for the
+    seeds: see docs/matching.md for how many of the poses a triple of rods finds.
     """
+    gain = spots.gain(frame)
+    search = _Search(spots, frame, prior, options)
     found: list[Hypothesis] = []
-    order = triple_order(frame, options.min_inliers)
-    searches: dict[tuple[int, int], SeedSearch] = {}
-    for level in range(len(frame), options.min_inliers - 1, -1):
-        for index, (lines, complete_from) in enumerate(order):
-            for rods_cut in range(len(frame), level - 1, -1):
-                if (index, rods_cut) not in searches:
-                    solver = _solver(frame, lines, round(6.0 * spots.sigma_mm + 0.05, 1))
-                    searches[index, rods_cut] = search_seeds(spots, frame, solver, rods_cut, prior, options.min_inliers)
-                starts = searches[index, rods_cut].reaching(level)
-                for start in range(0, len(starts.spot_of_line), _CHUNK):
-                    part = starts.take(slice(start, start + _CHUNK))
-                    found += [
-                        hypothesis
-                        for hypothesis in settle(spots, frame, part, options.min_inliers)
-                        if prior.angles(hypothesis.rotation[None])[0] <= prior.max_rotation
-                    ]
+    least_rods = len(frame) + 1
+    try:
+        for level in range(min(len(frame), len(spots.mm)), options.min_inliers - 1, -1):
+            if not found:
+                if search.hopeless(level):
+                    break
+                found = distinct(list(search.level(level, math.inf, [])), gain)
+            else:
+                most_chi_square = 2 * (level * gain - score(found[0], gain) + TOLD_APART)
+                if most_chi_square < 0:
+                    break
+                rivals = search.log10_by_chance(found[0], level, most_chi_square) > _LOG10_RIVALS
+                further = search.level if rivals else search.level_of_twins
+                found = distinct([*found, *further(level, most_chi_square, found)], gain)
+            least_rods = level
+    except _TooManyTriplesError:
+        return Found([], least_rods, f"given up after {_MOST_TRIPLES} triples of spots: too many look like the frame")
+    return Found(judged(found, spots, frame, search.seeds_by_visible), least_rods)
+
+
+class _TooManyTriplesError(Exception):
+    """A search goes on for too long."""
+
+
+class _Search:
+    """The seeds found so far, and explanations of so many rods from them."""
+
+    def __init__(self, spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> None:
+        self.seeds_by_visible = np.zeros(len(frame) - 2, dtype=np.int64)
+        self._spots, self._frame, self._prior, self._options = spots, frame, prior, options
+        self._order = triple_order(frame, options.min_inliers)
+        self._searched: dict[int, list[SeedSearch]] = {}
+        self._searched_down_to: dict[int, int] = {}
+        self._triples = 0
+
+    def hopeless(self, level: int) -> bool:
+        """Whether even a true match of so many rods would hardly be told from chance."""
+        spots = self._spots
+        area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
+        least = least_log10_false_alarms(
+            level, len(self._frame), len(spots.mm), self.seeds_by_visible, spots.variance_mm2, area_mm2
+        )
+        return least > self._options.max_log10_false_alarms
+
+    def log10_by_chance(self, best: Hypothesis, level: int, chi_square: float) -> float:
+        """log10 of how many explanations of `level` rods that fit so well are expected by chance; see `consensus`."""
+        return log10_by_chance(best, self._spots, self._frame, self.seeds_by_visible, level, chi_square)
+
+    def level(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
+        """Explanations of so many rods, or more, besides the known; most_chi_square: see `SeedSearch.reaching`."""
+        for index, (_, complete_from) in enumerate(self._order):
+            for seeds in self._seeds(index, level):
+                starts = seeds.reaching(level, most_chi_square, known)
+                for first in range(0, len(starts.spot_of_line), _CHUNK):
+                    part = starts.take(slice(first, first + _CHUNK))
+                    for hypothesis in settle(self._spots, self._frame, part, self._options.min_inliers):
+                        if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
+                            yield hypothesis
             if complete_from <= level:
-                break
-        found = distinct(found, spots)
-        if found and max(hypothesis.inliers for hypothesis in found) >= level:
-            break
-    seeds_by_visible = np.zeros(len(frame) - 2, dtype=np.int64)
-    for search in searches.values():
-        seeds_by_visible += search.seeds_by_visible
-    return judged(found, spots, frame, seeds_by_visible)
+                return
+
+    def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
+        """The same, but only from the spots of the best explanation known."""
+        rows = np.sort(known[0].spot_of_line[known[0].spot_of_line != UNMATCHED])
+        search = _Search(self._spots.only(rows), self._frame, self._prior.only(rows), self._options)
+        row_of = np.full(len(self._spots.mm) + 1, UNMATCHED)  # the last one is for UNMATCHED
+        row_of[rows] = np.arange(len(rows))
+        here = [replace(one, spot_of_line=row_of[one.spot_of_line]) for one in known]
+        for twin in search.level(level, most_chi_square, here):
+            matched = twin.spot_of_line != UNMATCHED
+            yield replace(twin, spot_of_line=np.where(matched, rows[twin.spot_of_line], UNMATCHED))
+
+    def _seeds(self, index: int, level: int) -> list[SeedSearch]:
+        """The seeds of the triple at `index` of the order where a slice may cut `level` rods or more."""
+        down_to = self._searched_down_to.get(index, len(self._frame) + 1)
+        if level < down_to:
+            if self._triples > _MOST_TRIPLES:
+                raise _TooManyTriplesError
+            solver = _solver(self._frame, self._order[index].lines, round(6.0 * self._spots.sigma_mm + 0.05, 1))
+            search = search_seeds(
+                self._spots, self._frame, solver, (level, down_to - 1), self._prior, self._options.min_inliers
+            )
+            self._triples += search.triples
+            self.seeds_by_visible += search.seeds_by_visible
+            self._searched.setdefault(index, []).append(search)
+            self._searched_down_to[index] = level
+        return self._searched[index]
 
 
 @lru_cache(maxsize=64)

@@ -10,18 +10,18 @@ a slice at right angles to them make normal, the steps end at the nearest point.
 from __future__ import annotations
 
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array
+from stereoreg_ros.geometry.pose import Array, cross
 
 # Pairs of the three rods, in the order of all arrays of three distances.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 _CELLS_PER_ROD = 14
-_STEPS = 4
+_STEPS, _POLISHING_STEPS = 3, 5
 # Bins of the table along each of the three distances.
 _BINS = 40
 # How much larger the bounds of a cell's distances are made than those of the points tried in it.
@@ -91,7 +91,7 @@ class ThreeLineSolver:
         self._nearest, self._farthest = nearest - tolerance_mm, farthest + tolerance_mm
         self._box = self._oblique_bounds()
         self._normals, self._normal_spread, self.rods_cut = self._planes(frame, least_cosine)
-        self._tables: dict[int, _Table] = {}
+        self._tables: dict[tuple[int, int], _Table] = {}
 
     def points(self, lambdas: Array) -> Array:
         """Points (..., 3, 3) mm of the frame at positions (..., 3) mm along the three rods."""
@@ -153,19 +153,18 @@ class ThreeLineSolver:
         return centre, np.arccos(np.minimum(turned, 1.0)), rods_cut
 
     def cells_near(self, normal: Array, angle: float) -> NDArray[np.bool_]:
-        """Cells (cells,) where the slice's normal may be within `angle` (rad) of a given one (3,) in the frame, or of its
-        opposite.
-        """
+        """Cells (cells,) where the slice's normal may be within `angle` (rad) of +-normal (3,) in the frame."""
         between = np.arccos(np.minimum(np.abs(self._normals @ normal), 1.0))
         near: NDArray[np.bool_] = between <= angle + self._normal_spread
         return near
 
-    def table(self, rods_cut: int) -> _Table:
-        """From distances to the cells in which a slice may cut just so many rods."""
-        if rods_cut not in self._tables:
-            cells = np.flatnonzero(self.rods_cut == rods_cut)
-            self._tables[rods_cut] = _Table.of(cells, self._nearest[cells], self._farthest[cells])
-        return self._tables[rods_cut]
+    def table(self, least_rods: int, most_rods: int) -> _Table:
+        """From distances to the cells in which a slice may cut so many rods, from the least to the most."""
+        key = (least_rods, most_rods)
+        if key not in self._tables:
+            cells = np.flatnonzero((self.rods_cut >= least_rods) & (self.rods_cut <= most_rods))
+            self._tables[key] = _Table.of(cells, self._nearest[cells], self._farthest[cells])
+        return self._tables[key]
 
     def _oblique_bounds(self) -> Array:
         """Rows (cells, 12) that turn three distances d into three numbers, 9 factors and 3 constants.
@@ -185,26 +184,20 @@ class ThreeLineSolver:
         constants = -np.einsum("cij,cj->ci", factors, centre) - (low + high) / 2 / half
         return np.concatenate([factors.reshape(-1, 9), constants], axis=1).astype(np.float32)
 
-    def solve(self, distances: Array, table: _Table, cells: NDArray[np.bool_] | None = None) -> Seeds:
+    def solve(
+        self, distances: NDArray[np.floating[Any]], table: _Table, cells: NDArray[np.bool_] | None = None
+    ) -> Seeds:
         """Positions for triples of spots, by their distances (3, t) mm in the order of PAIRS.
 
         table: of the cells in which solutions are sought; cells: (cells,), of these only the ones that are set.
         """
-        # Single precision is a thousand times finer than the noise, and twice as fast.
-        distances = distances.astype(np.float32, copy=False)
-        triple, cell = self._candidates(distances, table, cells)
-        known = [distance[triple] for distance in distances]
-        start = [self._single_centres[rod][cell] for rod in range(3)]
-        lambdas = start
-        for _ in range(_STEPS):
-            lambdas = [
-                value - np.minimum(np.maximum(step, -size), size)
-                for value, step, size in zip(
-                    lambdas, _damped_step(self._equations(lambdas, known)), self._cell.tolist(), strict=True
-                )
-            ]
-        equations = self._equations(lambdas, known)
-        misfit = np.maximum.reduce([np.abs(error) for error in equations.error])
+        # Many starts, most of them to be dropped, go in single precision: finer than the noise, and twice as fast.
+        single = distances.astype(np.float32, copy=False)
+        triple, cell = self._candidates(single, table, cells)
+        start = [centre[cell] for centre in self._single_centres]
+        known = [distance[triple] for distance in single]
+        lambdas = self._stepped(start, known, _STEPS)
+        misfit = np.maximum.reduce([np.abs(error) for error in self._equations(lambdas, known).error])
         found = misfit <= self.tolerance_mm
         for value, first, size, low, high in zip(
             lambdas, start, self._cell.tolist(), self.lambda_low.tolist(), self.lambda_high.tolist(), strict=True
@@ -216,13 +209,19 @@ class ThreeLineSolver:
         rows = rows[np.argsort(misfit[rows], kind="stable")]
         key = triple[rows].astype(np.int64)
         for value, low, size in zip(lambdas, self.lambda_low.tolist(), self._cell.tolist(), strict=True):
-            key = key * 128 + np.round((value[rows] - low) / (0.1 * size)).astype(np.int64)
+            key = key * 256 + np.round((value[rows] - low) / (0.1 * size)).astype(np.int64)
         _, first_of_key = np.unique(key, return_index=True)
         kept = np.sort(rows[first_of_key])  # in the order of the triples, as the candidates are
         triple = triple[kept]
-        ends = np.stack([value[kept] for value in lambdas])
-        longest = np.maximum.reduce([distance[triple] for distance in distances])
-        return Seeds(triple, ends.T, self._covariance(equations.take(kept), longest))
+        exact = [distance.astype(np.float64) for distance in distances[:, triple]]
+        ends = self._stepped([value[kept].astype(np.float64) for value in lambdas], exact, _POLISHING_STEPS)
+        equations = self._equations(ends, exact)
+        seeds = Seeds(triple, np.stack(ends).T, self._covariance(equations, np.maximum.reduce(exact)))
+        misfit = np.maximum.reduce([np.abs(error) for error in equations.error])
+        within = misfit <= self.tolerance_mm
+        for value, low, high in zip(ends, self.lambda_low, self.lambda_high, strict=True):
+            within &= (value >= low) & (value <= high)
+        return seeds if within.all() else seeds.take(within)
 
     def poses(self, lambdas: Array, spots_mm: Array) -> tuple[Array, Array]:
         """slice_from_frame (m, 3, 3), (m, 3) mm that lays the rods' points at lambdas (m, 3) on spots (m, 3, 2)."""
@@ -234,7 +233,7 @@ class ThreeLineSolver:
         return rotations, flat_centre - np.einsum("mij,mj->mi", rotations, centre)
 
     def _candidates(
-        self, distances: Array, table: _Table, cells: NDArray[np.bool_] | None
+        self, distances: NDArray[np.float32], table: _Table, cells: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows of triples, in order, and of the cells that their distances (3, t) allow."""
         triple, cell = table.look_up(distances)
@@ -251,6 +250,16 @@ class ThreeLineSolver:
             value += box[:, 9 + axis]
             fits &= np.abs(value) <= 1.0
         return triple[fits], cell[fits]
+
+    def _stepped(self, lambdas: list[Any], distances: list[Any], steps: int) -> list[Any]:
+        """Positions, three times (c,), after damped Newton steps, none longer than a cell."""
+        for _ in range(steps):
+            step = _damped_step(self._equations(lambdas, distances))
+            lambdas = [
+                value - np.minimum(np.maximum(change, -size), size)
+                for value, change, size in zip(lambdas, step, self._cell.tolist(), strict=True)
+            ]
+        return lambdas
 
     def _equations(self, lambdas: list[Array], distances: list[Array]) -> _Equations:
         """(d^2 - D^2) / 2D for each pair: the distance's error to first order, and smooth where rods meet.
@@ -311,7 +320,7 @@ class _Table(NamedTuple):
         order = np.argsort(flat, kind="stable")
         return cls(low, high, size, np.searchsorted(flat[order], np.arange(_BINS**3 + 1)), cells[row[order]])
 
-    def look_up(self, distances: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def look_up(self, distances: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows of triples and of cells that share a bin; distances: (3, t) mm."""
         possible = np.ones(len(distances[0]), dtype=bool)
         for distance, low, high in zip(distances, self.low.tolist(), self.high.tolist(), strict=True):
@@ -338,9 +347,6 @@ class _Equations(NamedTuple):
 
     error: list[Array]
     slope: list[tuple[Array, Array]]
-
-    def take(self, rows: NDArray[np.intp]) -> _Equations:
-        return _Equations([part[rows] for part in self.error], [(a[rows], b[rows]) for a, b in self.slope])
 
 
 def _inverse_normal(equations: _Equations, damping: Array | float) -> tuple[tuple[Array, ...], Array]:
@@ -371,7 +377,7 @@ def _triad(triangles: Array) -> Array:
     """Axes (m, 3, 3), in columns, that triangles (m, 3, 3) span."""
     side = triangles[:, 1] - triangles[:, 0]
     first = side / np.sqrt((side**2).sum(axis=1, keepdims=True))
-    across = np.cross(first, triangles[:, 2] - triangles[:, 0])
+    across = cross(first, triangles[:, 2] - triangles[:, 0])
     normal = across / np.sqrt((across**2).sum(axis=1, keepdims=True))
-    axes: Array = np.stack([first, np.cross(normal, first), normal], axis=-1)
+    axes: Array = np.stack([first, cross(normal, first), normal], axis=-1)
     return axes
