@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -133,15 +134,16 @@ def _widened(hypothesis: Hypothesis, difference: Array, behind: float) -> Hypoth
 
 
 def judged(
-    found: list[Hypothesis], spots: Spots, frame: Frame, seeds_by_visible: NDArray[np.int64]
+    found: list[Hypothesis], spots: Spots, frame: Frame, seeds_by_visible: Callable[[int], NDArray[np.int64]]
 ) -> list[Hypothesis]:
     """Of distinct explanations, best first, those that the best one does not rule out, with their false alarms.
 
-    seeds_by_visible: at v, how many seeds were found that have the slice cut v rods besides their own three.
+    seeds_by_visible: for so many inliers, at v, how many seeds were found that have the slice cut v rods besides their
+    own three.
     """
     gain = spots.gain(frame)
     return [
-        _with_significance(hypothesis, spots, frame, seeds_by_visible)
+        _with_significance(hypothesis, spots, frame, seeds_by_visible(hypothesis.inliers))
         for hypothesis in found
         if score(found[0], gain) - score(hypothesis, gain) < TOLD_APART
     ]

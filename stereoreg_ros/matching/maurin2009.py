@@ -141,7 +141,7 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
     # Every sample drawn is a pose that was tried, with any choice of the further rods.
     tried = np.zeros(len(frame) - 2, dtype=np.int64)
     tried[-1] = result.samples
-    return Found(judged(distinct(found, spots.gain(frame)), spots, frame, tried), SAMPLE + 1)
+    return Found(judged(distinct(found, spots.gain(frame)), spots, frame, lambda _: tried), SAMPLE + 1)
 
 
 def _has_collinear_triple(four: Array, smallest_sine: float) -> bool:

@@ -28,7 +28,7 @@ _FIRST_ORDER_SLACK = 10.0
 # A seed so near an explanation (mm, and the rotation matrix's elements) leads to it.
 _SAME_MM, _SAME_ROTATION = 5.0, 0.1
 # Triples of spots looked at in one piece: what belongs to it then stays in the processor's cache.
-_PIECE = 12000
+_PIECE = 40000
 # Stripes of the slice in which spots are looked up.
 _STRIPES = 256
 

@@ -29,7 +29,7 @@ _LEAST_CHI_SQUARE = 1e-6
 _LEAST_AREA_MM2 = 100.0
 # Clutter around the frame that uniform clutter would bring less often than this is taken to be denser there.
 _CROWDED = 0.01
-_FEWEST, _SHARE_OF_FEWEST = 4, 0.01
+_FEWEST, _SHARE_OF_FEWEST, _SHARE_OF_MORE = 4, 0.01, 0.125
 # How seldom a true match has a residual as small as that by which a search for one is held to be hopeless.
 _LUCK = 0.01
 
@@ -52,14 +52,30 @@ def log10_false_alarms(
     them; spot_variance_mm2: product of a spot's standard deviations in x and y; area_mm2: over which spots fall;
     share: of all false alarms that are allowed, those for this number of inliers.
     """
-    further = inliers - 3
     openness = np.diag([_OPEN_POSITION**-2] * 3 + [_OPEN_ROTATION**-2] * 3)
-    _, log_det = np.linalg.slogdet(information + openness)
-    _, log_det_seed = np.linalg.slogdet(seed_information + openness)
+    _, (log_det, log_det_seed) = np.linalg.slogdet(np.stack([information, seed_information]) + openness)
+    log_stretch = 0.5 * (log_det - log_det_seed)
+    return _log10_expected(inliers, spots, choices_of_rods, chi_square, log_stretch, spot_variance_mm2, area_mm2, share)
+
+
+def _log10_expected(
+    inliers: int,
+    spots: int,
+    choices_of_rods: int,
+    chi_square: float,
+    log_stretch: float,
+    spot_variance_mm2: float,
+    area_mm2: float,
+    share: float,
+) -> float:
+    """As `log10_false_alarms`; log_stretch: log of how many times larger than by the spots' own noise the ellipsoid is
+    in which the further spots are expected, by the noise of the seed.
+    """
+    further = inliers - 3
     log_volume = (
         further * math.log(math.pi * max(chi_square, _LEAST_CHI_SQUARE) * spot_variance_mm2)
         - math.lgamma(further + 1)
-        + 0.5 * (log_det - log_det_seed)
+        + log_stretch
     )
     log_chance = min(0.0, log_volume - further * math.log(area_mm2))
     log_choices = (
@@ -78,17 +94,15 @@ def least_log10_false_alarms(
 
     seeds_by_visible: of the seeds found so far; lines: of the frame; the others as in `log10_false_alarms`.
     """
-    chi_square = 2 * float(gammaincinv(inliers - 3, _LUCK)) if inliers > 3 else 0.0
-    return log10_false_alarms(
-        inliers,
-        spots,
-        choices_of_rods(seeds_by_visible, inliers),
-        chi_square,
-        np.zeros((6, 6)),
-        np.zeros((6, 6)),
-        variance_mm2,
-        area_mm2,
-        share_of(inliers, lines),
+    return _log10_expected(
+        inliers=inliers,
+        spots=spots,
+        choices_of_rods=choices_of_rods(seeds_by_visible, inliers),
+        chi_square=2 * float(gammaincinv(inliers - 3, _LUCK)),
+        log_stretch=0.0,
+        spot_variance_mm2=variance_mm2,
+        area_mm2=area_mm2,
+        share=share_of(inliers, lines),
     )
 
 
@@ -135,11 +149,11 @@ def clutter_area_mm2(spots_mm: Array, matched: NDArray[np.intp], slice_area_mm2:
 def share_of(inliers: int, lines: int) -> float:
     """Share of the allowed false alarms that matches of so many of the frame's rods get; all shares sum to one.
 
-    From five rods on each number gets half as much as the one below: the more rods, the less chance can bring, and the
-    less of the allowance is needed. Four rods have but one to confirm them and can hardly ever be told from chance:
-    they get a hundredth.
+    From five rods on each number gets an eighth of the one below: each rod more makes chance matches a thousand times
+    rarer, so that less of the allowance is needed. Four rods have but one to confirm them and can hardly ever be told
+    from chance: they get a hundredth.
     """
     if inliers == _FEWEST:
         return 1.0 if lines == _FEWEST else _SHARE_OF_FEWEST
-    total = sum(0.5**step for step in range(lines - _FEWEST))
-    return (1.0 - _SHARE_OF_FEWEST) * 0.5 ** (inliers - _FEWEST - 1) / total
+    total = sum(_SHARE_OF_MORE**step for step in range(lines - _FEWEST))
+    return (1.0 - _SHARE_OF_FEWEST) * _SHARE_OF_MORE ** (inliers - _FEWEST - 1) / total

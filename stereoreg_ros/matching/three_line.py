@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.matching.consensus import TOLD_APART, Spots, distinct, judged, log10_by_chance, score
@@ -39,9 +40,9 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
     Explanations of all rods are sought first, then of all but one, and so on. At each level every set of so many rods
     holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots. Where
     nothing is found, the search ends where so few rods could hardly be told from chance. Where something is found, it
-    goes on as long as an explanation of fewer rods, if it fits well, could come near: among all spots, or, where chance
-    would not bring one, among those of the best explanation, as a twin of the true pose has them. Complete but for the
-    seeds: see docs/matching.md for how many of the poses a triple of rods finds.
+    goes on as long as an explanation of fewer rods, if it fits well, could come near: among the spots of the best
+    explanation, as twins of a pose share them, and among all spots where chance may bring one that could be accepted.
+    Complete but for the seeds: see docs/matching.md for how many of the poses a triple of rods finds.
     """
     gain = spots.gain(frame)
     search = _Search(spots, frame, prior, options)
@@ -57,8 +58,7 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
                 most_chi_square = 2 * (level * gain - score(found[0], gain) + TOLD_APART)
                 if most_chi_square < 0:
                     break
-                rivals = search.log10_by_chance(found[0], level, most_chi_square) > _LOG10_RIVALS
-                further = search.level if rivals else search.level_of_twins
+                further = search.level if search.has_rivals(found[0], level, most_chi_square) else search.level_of_twins
                 found = distinct([*found, *further(level, most_chi_square, found)], gain)
             least_rods = level
     except _TooManyTriplesError:
@@ -74,25 +74,44 @@ class _Search:
     """The seeds found so far, and explanations of so many rods from them."""
 
     def __init__(self, spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> None:
-        self.seeds_by_visible = np.zeros(len(frame) - 2, dtype=np.int64)
         self._spots, self._frame, self._prior, self._options = spots, frame, prior, options
         self._order = triple_order(frame, options.min_inliers)
         self._searched: dict[int, list[SeedSearch]] = {}
         self._searched_down_to: dict[int, int] = {}
         self._triples = 0
 
+    def seeds_by_visible(self, level: int) -> NDArray[np.int64]:
+        """At v, how many seeds of those found so far have the slice cut v rods besides their own three.
+
+        Only those of the triples that explanations of `level` rods need: each such set of rods is counted once.
+        """
+        total = np.zeros(len(self._frame) - 2, dtype=np.int64)
+        for index, (_, complete_from) in enumerate(self._order):
+            for search in self._searched.get(index, []):
+                total += search.seeds_by_visible
+            if complete_from <= level:
+                break
+        return total
+
     def hopeless(self, level: int) -> bool:
         """Whether even a true match of so many rods would hardly be told from chance."""
         spots = self._spots
-        area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
         least = least_log10_false_alarms(
-            level, len(self._frame), len(spots.mm), self.seeds_by_visible, spots.variance_mm2, area_mm2
+            level,
+            len(self._frame),
+            len(spots.mm),
+            self.seeds_by_visible(level),
+            spots.variance_mm2,
+            area_of_uniform_mm2(spots.mm, spots.slice_area_mm2),
         )
         return least > self._options.max_log10_false_alarms
 
-    def log10_by_chance(self, best: Hypothesis, level: int, chi_square: float) -> float:
-        """log10 of how many explanations of `level` rods that fit so well are expected by chance; see `consensus`."""
-        return log10_by_chance(best, self._spots, self._frame, self.seeds_by_visible, level, chi_square)
+    def has_rivals(self, best: Hypothesis, level: int, chi_square: float) -> bool:
+        """Whether chance may bring explanations of `level` rods, of so low a chi-square, that could be accepted."""
+        if self.hopeless(level):
+            return False
+        by_chance = log10_by_chance(best, self._spots, self._frame, self.seeds_by_visible(level), level, chi_square)
+        return by_chance > _LOG10_RIVALS
 
     def level(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """Explanations of so many rods, or more, besides the known; most_chi_square: see `SeedSearch.reaching`."""
@@ -110,6 +129,9 @@ class _Search:
     def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """The same, but only from the spots of the best explanation known."""
         rows = np.sort(known[0].spot_of_line[known[0].spot_of_line != UNMATCHED])
+        if len(rows) == len(self._spots.mm):
+            yield from self.level(level, most_chi_square, known)
+            return
         search = _Search(self._spots.only(rows), self._frame, self._prior.only(rows), self._options)
         row_of = np.full(len(self._spots.mm) + 1, UNMATCHED)  # the last one is for UNMATCHED
         row_of[rows] = np.arange(len(rows))
@@ -129,7 +151,6 @@ class _Search:
                 self._spots, self._frame, solver, (level, down_to - 1), self._prior, self._options.min_inliers
             )
             self._triples += search.triples
-            self.seeds_by_visible += search.seeds_by_visible
             self._searched.setdefault(index, []).append(search)
             self._searched_down_to[index] = level
         return self._searched[index]

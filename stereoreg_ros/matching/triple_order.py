@@ -16,6 +16,7 @@ _PLANES = 400
 # Below this share of the best triple's quality a triple determines no pose (coplanar or all parallel rods).
 _USELESS = 1e-3
 _MOST_SUBSETS = 50_000
+_STEPS = 24
 
 
 class RankedTriple(NamedTuple):
@@ -62,10 +63,11 @@ def triple_order(frame: Frame, min_inliers: int) -> tuple[RankedTriple, ...]:
 
 
 def _qualities(frame: Frame) -> dict[tuple[int, int, int], float]:
-    """How well each triple of rods fixes the pose, over slices that may meet the frame.
+    """How well each triple of rods fixes the pose, over slices that may meet the frame, for the work it takes.
 
     For one slice: the smallest singular value of the distances' derivatives by the positions along the rods, times
-    how far the three cuts are from collinear; nothing where a rod is not cut. The mean over slices.
+    how far the three cuts are from collinear; nothing where a rod is not cut. The mean over slices, divided by the area
+    (squared) within which two spots can lie beside a third one: triples of false spots are as many.
     """
     rng = np.random.default_rng(0)  # a fixed sample: the order must not change from run to run
     points = np.concatenate([frame.starts, frame.ends])
@@ -97,4 +99,20 @@ def _quality(cuts: Array, inside: Array, directions: Array, triple: tuple[int, i
     weakest = np.linalg.svd(jacobian, compute_uv=False)[:, 2]
     twice_area = np.linalg.norm(np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]), axis=1)
     flatness = twice_area / np.max(sides, axis=0) ** 2
-    return float((weakest * flatness).sum() / len(cuts))
+    return float((weakest * flatness).sum() / len(cuts)) / _extent(np.array(sides))
+
+
+def _extent(sides: Array) -> float:
+    """Area, squared, mm^4, over which two spots can lie beside a third; sides (3, p) mm, distances 01, 02, 12."""
+    low, high = sides.min(axis=1), sides.max(axis=1)
+    # On a grid of polar coordinates about the first spot, the second one's direction being the first axis.
+    first = np.linspace(low[0], high[0], _STEPS + 1)[:-1] + (high[0] - low[0]) / _STEPS / 2
+    second = np.linspace(low[1], high[1], _STEPS + 1)[:-1] + (high[1] - low[1]) / _STEPS / 2
+    angle = (np.arange(_STEPS) + 0.5) * np.pi / _STEPS
+    third = np.sqrt(
+        first[:, None, None] ** 2 + second[:, None] ** 2 - 2 * first[:, None, None] * second[:, None] * np.cos(angle)
+    )
+    possible = (third >= low[2]) & (third <= high[2])
+    measure = first[:, None, None] * second[:, None] * possible
+    cell = (high[0] - low[0]) * (high[1] - low[1]) / _STEPS**2 * 2 * np.pi / _STEPS
+    return float(2 * np.pi * measure.sum() * cell) + 1.0

@@ -21,7 +21,8 @@ from stereoreg_ros.geometry.pose import Array, cross
 # Pairs of the three rods, in the order of all arrays of three distances.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 _CELLS_PER_ROD = 14
-_STEPS, _POLISHING_STEPS = 3, 5
+_STEPS, _SLOW_STEPS = 3, 4
+_SMALL_STEP_MM = 0.01
 # Bins of the table along each of the three distances.
 _BINS = 40
 # How much larger the bounds of a cell's distances are made than those of the points tried in it.
@@ -43,7 +44,7 @@ class Seeds(NamedTuple):
     lambdas: Array
     lambda_covariance: Array
 
-    def take(self, rows: NDArray[np.bool_]) -> Seeds:
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Seeds:
         """Only the given seeds."""
         return Seeds(self.triples[rows], self.lambdas[rows], self.lambda_covariance[rows])
 
@@ -204,24 +205,29 @@ class ThreeLineSolver:
         ):
             # A start that leads away leads to another cell's solution, or to none.
             found &= (np.abs(value - first) <= 1.25 * size) & (value >= low) & (value <= high)
-        rows = np.flatnonzero(found)
-        # Of step ends in one place the best is kept, which is found first when they are sorted by their misfit.
+        rows = self._distinct(np.flatnonzero(found), triple, lambdas, misfit)
+        exact = [distance.astype(np.float64) for distance in distances[:, triple[rows]]]
+        ends, are_slow = self._polished([value[rows].astype(np.float64) for value in lambdas], exact)
+        equations = self._equations(ends, exact)
+        seeds = Seeds(triple[rows], np.stack(ends).T, self._covariance(equations, np.maximum.reduce(exact)))
+        if not are_slow:
+            return seeds
+        misfit = np.maximum.reduce([np.abs(error) for error in equations.error])
+        found = misfit <= self.tolerance_mm
+        for value, low, high in zip(ends, self.lambda_low, self.lambda_high, strict=True):
+            found &= (value >= low) & (value <= high)
+        return seeds.take(self._distinct(np.flatnonzero(found), seeds.triples, ends, misfit))
+
+    def _distinct(
+        self, rows: NDArray[np.intp], triple: NDArray[np.intp], lambdas: list[Any], misfit: NDArray[Any]
+    ) -> NDArray[np.intp]:
+        """Of rows with the same triple that lie in one place the one of least misfit; in the order of the triples."""
+        # The first of each place is kept, which is the best when they are sorted by their misfit.
         rows = rows[np.argsort(misfit[rows], kind="stable")]
         key = triple[rows].astype(np.int64)
         for value, low, size in zip(lambdas, self.lambda_low.tolist(), self._cell.tolist(), strict=True):
             key = key * 256 + np.round((value[rows] - low) / (0.1 * size)).astype(np.int64)
-        _, first_of_key = np.unique(key, return_index=True)
-        kept = np.sort(rows[first_of_key])  # in the order of the triples, as the candidates are
-        triple = triple[kept]
-        exact = [distance.astype(np.float64) for distance in distances[:, triple]]
-        ends = self._stepped([value[kept].astype(np.float64) for value in lambdas], exact, _POLISHING_STEPS)
-        equations = self._equations(ends, exact)
-        seeds = Seeds(triple, np.stack(ends).T, self._covariance(equations, np.maximum.reduce(exact)))
-        misfit = np.maximum.reduce([np.abs(error) for error in equations.error])
-        within = misfit <= self.tolerance_mm
-        for value, low, high in zip(ends, self.lambda_low, self.lambda_high, strict=True):
-            within &= (value >= low) & (value <= high)
-        return seeds if within.all() else seeds.take(within)
+        return np.sort(rows[np.unique(key, return_index=True)[1]])
 
     def poses(self, lambdas: Array, spots_mm: Array) -> tuple[Array, Array]:
         """slice_from_frame (m, 3, 3), (m, 3) mm that lays the rods' points at lambdas (m, 3) on spots (m, 3, 2)."""
@@ -260,6 +266,19 @@ class ThreeLineSolver:
                 for value, change, size in zip(lambdas, step, self._cell.tolist(), strict=True)
             ]
         return lambdas
+
+    def _polished(self, lambdas: list[Array], distances: list[Array]) -> tuple[list[Array], bool]:
+        """Positions, three times (c,), after a step, and more where that one was not small: near double roots; and
+        whether there were such.
+        """
+        ends = self._stepped(lambdas, distances, 1)
+        moved = np.maximum.reduce([np.abs(end - value) for end, value in zip(ends, lambdas, strict=True)])
+        rows = np.flatnonzero(moved > _SMALL_STEP_MM)
+        if rows.size:
+            slow = self._stepped([end[rows] for end in ends], [known[rows] for known in distances], _SLOW_STEPS)
+            for end, value in zip(ends, slow, strict=True):
+                end[rows] = value
+        return ends, bool(rows.size)
 
     def _equations(self, lambdas: list[Array], distances: list[Array]) -> _Equations:
         """(d^2 - D^2) / 2D for each pair: the distance's error to first order, and smooth where rods meet.
