@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,7 @@ from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.matching import maurin2009, three_line
 from stereoreg_ros.matching.consensus import Spots
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.near import match_near
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
@@ -36,11 +38,17 @@ _IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
 _WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 1.0, 1.0
 
 
-def register_slice(ct_slice: Slice, frame: Frame, options: RegistrationOptions | None = None) -> Registration | Refusal:
-    """Register `frame` from one slice: scanner_from_frame in mm, or a refusal with its reason."""
+def register_slice(
+    ct_slice: Slice, frame: Frame, options: RegistrationOptions | None = None, previous: Pose | None = None
+) -> Registration | Refusal:
+    """Register `frame` from one slice: scanner_from_frame in mm, or a refusal with its reason.
+
+    previous: see `register_spots`.
+    """
     options = options or RegistrationOptions()
     spots_px = find_spots(ct_slice, options)
-    return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice, _area_mm2(ct_slice))
+    area_mm2 = _area_mm2(ct_slice)
+    return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice, area_mm2, previous)
 
 
 def register_frames(
@@ -71,11 +79,15 @@ def register_spots(
     options: RegistrationOptions | None = None,
     scanner_from_slice: Pose | None = None,
     slice_area_mm2: float | None = None,
+    previous: Pose | None = None,
 ) -> Registration | Refusal:
     """Register `frame` from the centres of bright spots (n, 2) in pixel (u, v), false ones among them.
 
     scanner_from_slice: where the slice lies in the scanner; by default the scanner is the slice. slice_area_mm2: the
-    area over which spots could have been found; by default it is judged by the spots themselves.
+    area over which spots could have been found; by default it is judged by the spots themselves. previous: a guess,
+    scanner_from_frame of the slice before; where the frame is still near it, little else has to be searched, and chance
+    brings less. Half of the false alarms that are allowed are for poses near the guess, half for all poses, so that a
+    guess however wrong costs no certainty. The matcher `maurin2009` makes no use of it.
     Raises ValueError where the spots are not of shape (n, 2) or not finite.
     """
     options = options or RegistrationOptions()
@@ -100,7 +112,13 @@ def register_spots(
     spots = _prepare(spots_px, scale, options.spot_noise_px, slice_area_mm2)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
-    found = _MATCHERS[options.matcher](spots, frame, prior, options)
+    found = None
+    if previous is not None and options.matcher == "three_line":
+        # Each of the two searches gets half of the false alarms that are allowed.
+        options = replace(options, max_log10_false_alarms=options.max_log10_false_alarms - math.log10(2))
+        found = match_near(spots, frame, prior, options, scanner_from_slice.inverse() @ previous)
+    if found is None:
+        found = _MATCHERS[options.matcher](spots, frame, prior, options)
     estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in found.hypotheses)
     if found.given_up:
         return refuse("no_consensus", f"the search among {count} spots was {found.given_up}", estimates)
@@ -111,7 +129,7 @@ def register_spots(
         return refuse(
             "no_consensus",
             f"chance alone would bring 10^{best.log10_false_alarms:.1f} matches as good as the best one, of "
-            f"{best.inliers} rods among {count} spots; at most 10^{options.max_log10_false_alarms:g} are allowed",
+            f"{best.inliers} rods among {count} spots; at most 10^{options.max_log10_false_alarms:.3g} are allowed",
             estimates,
         )
     plausibility = float(gammaincc(best.degrees_of_freedom / 2, best.chi_square / 2))

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -16,28 +14,42 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.pose_volume import plane_sample, pose_volume
+from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.significance import (
-    LEAST_COSINE,
+    Chance,
     area_of_uniform_mm2,
-    choices_of_rods,
     clutter_area_mm2,
-    log10_false_alarms,
+    log10_expected,
+    lucky_chi_square,
     share_of,
 )
+from stereoreg_ros.matching.visibility import LEAST_COSINE, SURE_MM
+from stereoreg_ros.options import RegistrationOptions
 
 # Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
 GATE = 18.4
 # Height in chi-square of the ridge between two optima below which they are one valley; and its largest extent, rad.
 _RIDGE = 4.0
 _LARGEST_VALLEY = 0.5
+# So far behind the best one (log-likelihood) an explanation is forgotten.
+_FAR_BEHIND = 30.0
+# Explanations are never held to be told apart by less than this many decades of likelihood.
+_LEAST_DECADES_APART = 1.0
+# Spots do not leave a direction of the pose wholly open: where they do so to first order, the second bounds it. Stated
+# as standard deviations: of a rotation in rad, of a position in mm.
+_OPEN_ROTATION = 0.1
+_OPEN_POSITION = 10.0
+# Spots do not leave a direction of the pose wholly open: where they do so to first order, the second bounds it. Stated
+# as standard deviations: of a rotation in rad, of a position in mm.
+_OPEN_ROTATION = 0.1
+_OPEN_POSITION = 10.0
 # A likelihood ratio, as log, by which explanations count as told apart; a thousand to one.
 TOLD_APART = 6.9
 
 
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
 MISSING_COST = 3.0
-# A rod is surely cut only so far from its ends, mm.
-SURE_MM = 2.0
 
 
 class Spots(NamedTuple):
@@ -96,7 +108,7 @@ def distinct(found: list[Hypothesis], gain: float) -> list[Hypothesis]:
     found = sorted(found, key=lambda h: -scores[id(h)])
     kept: list[Hypothesis] = []
     for hypothesis in found:
-        if scores[id(found[0])] - scores[id(hypothesis)] > 2 * TOLD_APART:
+        if scores[id(found[0])] - scores[id(hypothesis)] > _FAR_BEHIND:
             break
         for row, other in enumerate(kept):
             difference = _difference(hypothesis, other)
@@ -133,57 +145,60 @@ def _widened(hypothesis: Hypothesis, difference: Array, behind: float) -> Hypoth
     return replace(hypothesis, information=np.linalg.pinv(covariance))
 
 
-def judged(
-    found: list[Hypothesis], spots: Spots, frame: Frame, seeds_by_visible: Callable[[int], NDArray[np.int64]]
-) -> list[Hypothesis]:
+def decades_apart(options: RegistrationOptions) -> float:
+    """By how many decades of likelihood explanations must differ to count as told apart.
+
+    Half of those by which chance must be ruled out, a thousand to one by default: who wants more certainty of the one
+    kind wants more of the other.
+    """
+    return max(-options.max_log10_false_alarms / 2, _LEAST_DECADES_APART)
+
+
+def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, apart: float) -> list[Hypothesis]:
     """Of distinct explanations, best first, those that the best one does not rule out, with their false alarms.
 
-    seeds_by_visible: for so many inliers, at v, how many seeds were found that have the slice cut v rods besides their
-    own three.
+    apart: see `decades_apart`.
+
+    They must come near the best one in likelihood, and in how rare they are by chance: from a few spots of the frame's
+    own, chance soon makes a match of one or two rods less.
     """
     gain = spots.gain(frame)
-    return [
-        _with_significance(hypothesis, spots, frame, seeds_by_visible(hypothesis.inliers))
-        for hypothesis in found
-        if score(found[0], gain) - score(hypothesis, gain) < TOLD_APART
+    rivals = [
+        replace(one, log10_false_alarms=log10_false_alarms(one, spots, frame, prior))
+        for one in found
+        if score(found[0], gain) - score(one, gain) < apart * math.log(10)
     ]
+    return [one for one in rivals if one.log10_false_alarms <= rivals[0].log10_false_alarms + apart]
 
 
-def _with_significance(
-    hypothesis: Hypothesis, spots: Spots, frame: Frame, seeds_by_visible: NDArray[np.int64]
-) -> Hypothesis:
-    value = log10_by_chance(hypothesis, spots, frame, seeds_by_visible, hypothesis.inliers, hypothesis.chi_square)
-    return replace(hypothesis, log10_false_alarms=value - math.log10(share_of(hypothesis.inliers, len(frame))))
+def log10_false_alarms(hypothesis: Hypothesis, spots: Spots, frame: Frame, prior: Prior) -> float:
+    """log10 of how many explanations as good as this one chance brings, over its share of those that are allowed."""
+    lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
+    cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
+    jacobian = (spots.whitening @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
+    openness = np.diag([_OPEN_POSITION**-2] * 3 + [_OPEN_ROTATION**-2] * 3)
+    determinant = float(np.linalg.det(jacobian.T @ jacobian + openness))
+    ratio = math.sqrt(determinant) * spots.variance_mm2**3
+    area_mm2 = clutter_area_mm2(spots.mm, hypothesis.spot_of_line[lines], spots.slice_area_mm2)
+    volume = pose_volume(frame, len(lines), prior, area_mm2)
+    chance = Chance(len(spots.mm), area_mm2, spots.variance_mm2, ratio * volume)
+    return log10_expected(len(lines), hypothesis.chi_square, chance) - math.log10(share_of(len(lines), len(frame)))
 
 
-def log10_by_chance(
-    hypothesis: Hypothesis,
-    spots: Spots,
-    frame: Frame,
-    seeds_by_visible: NDArray[np.int64],
-    inliers: int,
-    chi_square: float,
-) -> float:
-    """log10 of the expected number of explanations that chance brings of so many rods, with a chi-square this low.
+def least_log10_false_alarms(inliers: int, spots: Spots, frame: Frame, prior: Prior) -> float:
+    """What `log10_false_alarms` of a true explanation of so many rods is hardly ever below."""
+    ratio = plane_sample(frame, inliers).low_ratio
+    value = log10_expected(inliers, lucky_chi_square(inliers), _chance(inliers, ratio, spots, frame, prior))
+    return value - math.log10(share_of(inliers, len(frame)))
 
-    Poses are taken to be determined as well as by the hypothesis.
-    """
-    used = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
-    cuts = cut(frame, hypothesis.rotation[None], hypothesis.translation[None])
-    jacobian = (spots.whitening @ cut_jacobian(cuts, hypothesis.translation[None]))[0]
-    by_line = np.swapaxes(jacobian, 1, 2) @ jacobian
-    # Any three of the rods could have been the seed; the one that fixes the pose best predicts the sharpest.
-    triples = np.array(list(combinations(used, 3)))
-    seeds = by_line[triples].sum(axis=1)
-    best = seeds[np.argmax(np.linalg.slogdet(seeds)[1])]
-    return log10_false_alarms(
-        inliers=inliers,
-        spots=len(spots.mm),
-        choices_of_rods=choices_of_rods(seeds_by_visible, inliers),
-        chi_square=chi_square,
-        information=by_line[used].sum(axis=0),
-        seed_information=best,
-        spot_variance_mm2=spots.variance_mm2,
-        area_mm2=clutter_area_mm2(spots.mm, hypothesis.spot_of_line[used], spots.slice_area_mm2),
-        share=1.0,
-    )
+
+def log10_by_chance(inliers: int, chi_square: float, spots: Spots, frame: Frame, prior: Prior) -> float:
+    """log10 of how many explanations of so many rods, with a chi-square this low, chance brings within the prior."""
+    ratio = plane_sample(frame, inliers).mean_ratio
+    return log10_expected(inliers, chi_square, _chance(inliers, ratio, spots, frame, prior))
+
+
+def _chance(inliers: int, ratio: float, spots: Spots, frame: Frame, prior: Prior) -> Chance:
+    area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
+    volume = pose_volume(frame, inliers, prior, area_mm2)
+    return Chance(len(spots.mm), area_mm2, spots.variance_mm2, ratio * volume)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.matching.consensus import Spots, count_missing, distinct, judged
+from stereoreg_ros.matching.consensus import Spots, count_missing, decades_apart, distinct, judged
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
@@ -138,10 +138,8 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
         )
         for i in np.flatnonzero(kept)
     ]
-    # Every sample drawn is a pose that was tried, with any choice of the further rods.
-    tried = np.zeros(len(frame) - 2, dtype=np.int64)
-    tried[-1] = result.samples
-    return Found(judged(distinct(found, spots.gain(frame)), spots, frame, lambda _: tried), SAMPLE + 1)
+    found = distinct(found, spots.gain(frame))
+    return Found(judged(found, spots, frame, prior, decades_apart(options)), SAMPLE + 1)
 
 
 def _has_collinear_triple(four: Array, smallest_sine: float) -> bool:

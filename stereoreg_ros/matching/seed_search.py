@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.matching.consensus import GATE, MISSING_COST, SURE_MM, Spots
+from stereoreg_ros.matching.consensus import GATE, MISSING_COST, Spots
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.significance import LEAST_COSINE
+from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE, SURE_MM
 from stereoreg_ros.solvers.three_lines import PAIRS, Seeds, ThreeLineSolver
 
-# How far beyond its end a rod may be cut: the noise apart, partial volume makes its end unsharp.
-END_SLACK_MM = 1.0
 # A seed's prediction is of first order only: its gate need but let the right spot through.
 _SEED_GATE = 2 * GATE
 # Spots whose triangle is flatter than this (height over a side) fix no pose: rods of one plane.
@@ -58,8 +56,8 @@ class SeedSearch(NamedTuple):
     that seed that is predicted the sharpest, and so on; hit_squared: (h,), squared distance in standard deviations.
     nearest_hits: (m, n), spot_of_line with the nearest hit of every rod; nearest_squared: (m, k), its squared distance
     for each further rod. reach: (m,), three and the number of further rods that are hit: no consensus has more.
-    owed: (m,), rods that the slice must cut among the spots, and that are not hit. seeds_by_visible: at v, how many
-    seeds within the prior, whatever they hit, have the slice cut v further rods. triples: how many were looked at.
+    owed: (m,), rods that the slice must cut among the spots, and that are not hit.
+    triples: how many were looked at.
     """
 
     rotations: Array
@@ -74,7 +72,6 @@ class SeedSearch(NamedTuple):
     nearest_squared: Array
     reach: NDArray[np.intp]
     owed: NDArray[np.intp]
-    seeds_by_visible: NDArray[np.int64]
     triples: int
 
     def reaching(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Starts:
@@ -146,30 +143,13 @@ def search_seeds(
         part = slice(start, start + _PIECE)
         seeds = solver.solve(distances[:, part], table, cells)
         own_spots = triples[:, part][:, seeds.triples]
-        counts = np.ones(len(seeds.triples), dtype=bool)
         if cells is not None:
-            turned = prior.angles(solver.poses(seeds.lambdas, spots.mm[own_spots.T])[0])
-            near = turned <= prior.seed_angle
-            counts = turned[near] <= prior.max_rotation
+            near = prior.angles(solver.poses(seeds.lambdas, spots.mm[own_spots.T])[0]) <= prior.seed_angle
             own_spots, seeds = own_spots[:, near], seeds.take(near)
         predicted = _predict(spots, frame, solver, others, own_spots, seeds)
-        visible = np.bincount(predicted.visible[counts & predicted.upright], minlength=len(others) + 1)
         hits = _hits(spots, stripes, predicted, own_spots, others, prior)
-        pieces.append(
-            _kept(
-                spots,
-                frame,
-                solver,
-                others,
-                own_spots,
-                seeds,
-                predicted.sure,
-                hits,
-                visible,
-                distances[:, part].shape[1],
-                min_inliers,
-            )
-        )
+        tried = triples[:, part].shape[1]
+        pieces.append(_kept(spots, frame, solver, others, own_spots, seeds, predicted.sure, hits, tried, min_inliers))
     return _merged(pieces)
 
 
@@ -185,8 +165,8 @@ def spot_triples(
     allowed = []
     for row, (a, b) in enumerate(PAIRS):
         pair = (distance >= max(low[row], _LEAST_DISTANCE_MM)) & (distance <= high[row])
-        if prior.spots_of_line is not None:
-            pair &= prior.spots_of_line[lines[a]][:, None] & prior.spots_of_line[lines[b]]
+        if prior.near is not None:
+            pair &= prior.near.spots_of_line[lines[a]][:, None] & prior.near.spots_of_line[lines[b]]
         allowed.append(pair)
     first, second = np.nonzero(allowed[0])
     chosen, third = np.nonzero(allowed[1][first] & allowed[2][second])
@@ -226,8 +206,7 @@ class _Prediction(NamedTuple):
     """Where m seeds have the slice cut k further rods; arrays are (k, m) where nothing else is said.
 
     x, y: mm in the slice; xx, yy, xy: their covariance, mm^2, with the noise of the spot that is looked for; on_rod:
-    whether the cut may lie on the rod; sure: whether it must, and among the spots. visible (m,): how many rods the seed
-    has the slice cut; upright (m,): whether it has its own rods leave the slice steeply enough to count.
+    whether the cut may lie on the rod; sure: whether it must, and among the spots.
     """
 
     x: Array
@@ -237,8 +216,6 @@ class _Prediction(NamedTuple):
     xy: Array
     on_rod: NDArray[np.bool_]
     sure: NDArray[np.bool_]
-    visible: NDArray[np.intp]
-    upright: NDArray[np.bool_]
 
 
 def _predict(
@@ -297,18 +274,15 @@ def _predict(
         slide = 4.0 * np.sqrt(np.maximum(xx, yy) / np.maximum(slope_x**2 + slope_y**2, 0.01))
         low, high = frame.lambda_min[others, None] - END_SLACK_MM, frame.lambda_max[others, None] + END_SLACK_MM
         upright = np.abs(to_z) >= LEAST_COSINE
-        visible = ((lambdas >= low) & (lambdas <= high) & upright).sum(axis=0)
         on_rod = (lambdas >= low - slide) & (lambdas <= high + slide)
         slide += END_SLACK_MM + SURE_MM
         sure = (lambdas >= low + slide) & (lambdas <= high - slide) & upright
     longest = np.maximum(ax**2 + ay**2, bx**2 + by**2)
     on_rod &= np.abs(ax * by - ay * bx) > _LEAST_FLATNESS * longest
-    # A seed that leans its own rods too far is not one that is sought, though it may lead to one.
-    own_upright = np.abs(own_z).min(axis=0) >= LEAST_COSINE
     x = corner_x[0] + second * ax + third * bx
     y = corner_y[0] + second * ay + third * by
     sure &= spots.surround(np.stack([x, y], axis=-1))
-    return _Prediction(x, y, xx, yy, xy, on_rod, sure, visible, own_upright)
+    return _Prediction(x, y, xx, yy, xy, on_rod, sure)
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -354,8 +328,8 @@ def _hits(
     squared = yy[row] * off_x**2 + xx[row] * off_y**2 - 2 * xy[row] * off_x * off_y
     other, seed = np.divmod(chosen[row], max(own_spots.shape[1], 1))
     inside = (squared <= _SEED_GATE * area) & (own_spots[:, seed] != spot).all(axis=0)
-    if prior.spots_of_line is not None:
-        inside &= prior.spots_of_line[others[other], spot]
+    if prior.near is not None:
+        inside &= prior.near.spots_of_line[others[other], spot]
     return _Hits(seed[inside], other[inside], spot[inside], area[inside], squared[inside] / area[inside])
 
 
@@ -368,7 +342,6 @@ def _kept(
     seeds: Seeds,
     sure: NDArray[np.bool_],
     hits: _Hits,
-    seeds_by_visible: NDArray[np.intp],
     triples: int,
     min_inliers: int,
 ) -> SeedSearch:
@@ -400,7 +373,6 @@ def _kept(
         nearest_squared,
         reach[rows],
         (sure.T[rows] & ~is_hit[rows]).sum(axis=1),
-        seeds_by_visible.astype(np.int64),
         triples,
     )
 
@@ -426,6 +398,5 @@ def _merged(pieces: list[SeedSearch]) -> SeedSearch:
         joined("nearest_squared"),
         joined("reach"),
         joined("owed"),
-        np.sum([piece.seeds_by_visible for piece in pieces], axis=0),
         sum(piece.triples for piece in pieces),
     )

@@ -10,8 +10,8 @@ from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut_jacobian
 from stereoreg_ros.matching.consensus import GATE, Spots, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
-from stereoreg_ros.matching.seed_search import END_SLACK_MM, Starts
-from stereoreg_ros.matching.significance import LEAST_COSINE
+from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
 _ROUNDS = 4

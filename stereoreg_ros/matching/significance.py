@@ -1,16 +1,20 @@
 """How many matches as good as this one chance alone would bring.
 
 A contrario (Desolneux, Moisan, Morel; Moisan and Stival 2004). Under chance, spots are independent and uniform over an
-area. A hypothesis is a seed, a pose through three rods and three spots, and a choice of further rods that the pose has
-the slice cut, with a spot for each. Given the seed, the further spots lie where it predicts them, with a joint
-covariance that holds both their own noise and that of the seed. A fit with residual chi-square q means that they fell
-into the ellipsoid of that q; its volume over the area's power is the chance of that. The expected number of hypotheses
-as good is that chance times the number of hypotheses there are: the seeds that were found, each with its choices.
+area A. A match of k rods with a chi-square q means that k of the n spots, in an order, lie near the surface that the
+poses make in the space of 2k coordinates: within the ball across it, of 2k - 6 dimensions and of radius sqrt(q) sigma.
+The allowed false alarms are spread evenly over the poses' volume V (see `matching.pose_volume`), of which a piece is
+moved to a piece of the surface sqrt det J'J times as large. So chance brings
+
+    n! / (n - k)!  A^-k  V sqrt det J'J  pi^(k - 3) / (k - 3)!  (q sigma^2)^(k - 3)
+
+matches that are as good: see docs/matching.md.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +22,6 @@ from scipy.special import gammainc, gammaincinv
 
 from stereoreg_ros.geometry.pose import Array
 
-# A rod that leaves the slice at less than 11.5 degrees (sine 0.2) has a streak for a spot: neither sought nor counted.
-LEAST_COSINE = 0.2
-# A seed does not leave a direction of the pose wholly open: the squares of distances bound it (see
-# `ThreeLineSolver._covariance`). Stated as standard deviations: of a rotation in rad, of a position in mm.
-_OPEN_ROTATION = 0.1
-_OPEN_POSITION = 10.0
 # Chi-square of a perfect fit, to rounding; exact data must not make the number of false alarms vanish.
 _LEAST_CHI_SQUARE = 1e-6
 _LEAST_AREA_MM2 = 100.0
@@ -34,84 +32,38 @@ _FEWEST, _SHARE_OF_FEWEST, _SHARE_OF_MORE = 4, 0.01, 0.125
 _LUCK = 0.01
 
 
-def log10_false_alarms(
-    inliers: int,
-    spots: int,
-    choices_of_rods: int,
-    chi_square: float,
-    information: Array,
-    seed_information: Array,
-    spot_variance_mm2: float,
-    area_mm2: float,
-    share: float,
-) -> float:
-    """log10 of the expected number of matches by chance of `inliers` rods with a chi-square this low.
+@dataclass(frozen=True)
+class Chance:
+    """What decides how much chance brings.
 
-    spots: how many there are; choices_of_rods: over all seeds, the number of ways to choose the further rods among
-    those that the seed has the slice cut; information, seed_information (6, 6): J'J of all matches, and of three of
-    them; spot_variance_mm2: product of a spot's standard deviations in x and y; area_mm2: over which spots fall;
-    share: of all false alarms that are allowed, those for this number of inliers.
+    spots: how many there are; area_mm2: over which they fall; variance_mm2: product of a spot's standard deviations in
+    x and y; measure_mm6: V sqrt det J'J, what the surface of the poses measures if it is everywhere as stretched.
     """
-    openness = np.diag([_OPEN_POSITION**-2] * 3 + [_OPEN_ROTATION**-2] * 3)
-    _, (log_det, log_det_seed) = np.linalg.slogdet(np.stack([information, seed_information]) + openness)
-    log_stretch = 0.5 * (log_det - log_det_seed)
-    return _log10_expected(inliers, spots, choices_of_rods, chi_square, log_stretch, spot_variance_mm2, area_mm2, share)
+
+    spots: int
+    area_mm2: float
+    variance_mm2: float
+    measure_mm6: float
 
 
-def _log10_expected(
-    inliers: int,
-    spots: int,
-    choices_of_rods: int,
-    chi_square: float,
-    log_stretch: float,
-    spot_variance_mm2: float,
-    area_mm2: float,
-    share: float,
-) -> float:
-    """As `log10_false_alarms`; log_stretch: log of how many times larger than by the spots' own noise the ellipsoid is
-    in which the further spots are expected, by the noise of the seed.
-    """
+def log10_expected(inliers: int, chi_square: float, chance: Chance) -> float:
+    """log10 of the expected number of matches by chance of so many rods, with a chi-square this low."""
     further = inliers - 3
+    if inliers > chance.spots or chance.measure_mm6 <= 0:
+        return -math.inf
     log_volume = (
-        further * math.log(math.pi * max(chi_square, _LEAST_CHI_SQUARE) * spot_variance_mm2)
+        math.log(chance.measure_mm6)
+        + further * math.log(math.pi * max(chi_square, _LEAST_CHI_SQUARE) * chance.variance_mm2)
         - math.lgamma(further + 1)
-        + log_stretch
     )
-    log_chance = min(0.0, log_volume - further * math.log(area_mm2))
-    log_choices = (
-        math.log(max(choices_of_rods, 1))
-        + math.lgamma(spots - 3 + 1)
-        - math.lgamma(spots - inliers + 1)
-        - math.log(share)
-    )
-    return float((log_chance + log_choices) / math.log(10.0))
+    log_probability = log_volume - inliers * math.log(chance.area_mm2)
+    log_orders = math.lgamma(chance.spots + 1) - math.lgamma(chance.spots - inliers + 1)
+    return (log_probability + log_orders) / math.log(10.0)
 
 
-def least_log10_false_alarms(
-    inliers: int, lines: int, spots: int, seeds_by_visible: NDArray[np.int64], variance_mm2: float, area_mm2: float
-) -> float:
-    """What log10_false_alarms of a true match of so many rods is hardly ever below: once in a hundred.
-
-    seeds_by_visible: of the seeds found so far; lines: of the frame; the others as in `log10_false_alarms`.
-    """
-    return _log10_expected(
-        inliers=inliers,
-        spots=spots,
-        choices_of_rods=choices_of_rods(seeds_by_visible, inliers),
-        chi_square=2 * float(gammaincinv(inliers - 3, _LUCK)),
-        log_stretch=0.0,
-        spot_variance_mm2=variance_mm2,
-        area_mm2=area_mm2,
-        share=share_of(inliers, lines),
-    )
-
-
-def choices_of_rods(seeds_by_visible: NDArray[np.int64], inliers: int) -> int:
-    """Over all seeds, the number of ways to choose the further rods of a match of so many.
-
-    seeds_by_visible: at v, how many seeds have the slice cut v rods besides their own three.
-    """
-    return sum(int(seeds) * math.comb(visible, inliers - 3) for visible, seeds in enumerate(seeds_by_visible))
+def lucky_chi_square(inliers: int) -> float:
+    """Chi-square that a true match of so many rods is hardly ever below: once in a hundred."""
+    return 2 * float(gammaincinv(inliers - 3, _LUCK))
 
 
 def area_of_uniform_mm2(spots_mm: Array, slice_area_mm2: float | None) -> float:

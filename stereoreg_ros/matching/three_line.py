@@ -8,21 +8,29 @@ to stop, is said here.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.matching.consensus import TOLD_APART, Spots, distinct, judged, log10_by_chance, score
+from stereoreg_ros.matching.consensus import (
+    Spots,
+    decades_apart,
+    distinct,
+    judged,
+    least_log10_false_alarms,
+    log10_by_chance,
+    log10_false_alarms,
+    score,
+)
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.seed_search import END_SLACK_MM, SeedSearch, search_seeds
+from stereoreg_ros.matching.seed_search import SeedSearch, search_seeds
 from stereoreg_ros.matching.settling import settle
-from stereoreg_ros.matching.significance import LEAST_COSINE, area_of_uniform_mm2, least_log10_false_alarms
 from stereoreg_ros.matching.triple_order import triple_order
+from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.three_lines import ThreeLineSolver
 
@@ -34,8 +42,14 @@ _MOST_TRIPLES = 6_000_000
 _LOG10_RIVALS = -3.0
 
 
-def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> Found:
-    """All explanations of the spots that the best one does not rule out.
+def match(
+    spots: Spots,
+    frame: Frame,
+    prior: Prior,
+    options: RegistrationOptions,
+    known: Sequence[Hypothesis] = (),
+) -> Found:
+    """All explanations of the spots that the best one does not rule out; known: some of them, not sought again.
 
     Explanations of all rods are sought first, then of all but one, and so on. At each level every set of so many rods
     holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots. Where
@@ -44,9 +58,9 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
     explanation, as twins of a pose share them, and among all spots where chance may bring one that could be accepted.
     Complete but for the seeds: see docs/matching.md for how many of the poses a triple of rods finds.
     """
-    gain = spots.gain(frame)
+    gain, apart = spots.gain(frame), decades_apart(options)
     search = _Search(spots, frame, prior, options)
-    found: list[Hypothesis] = []
+    found = list(known)
     least_rods = len(frame) + 1
     try:
         for level in range(min(len(frame), len(spots.mm)), options.min_inliers - 1, -1):
@@ -55,15 +69,15 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
                     break
                 found = distinct(list(search.level(level, math.inf, [])), gain)
             else:
-                most_chi_square = 2 * (level * gain - score(found[0], gain) + TOLD_APART)
-                if most_chi_square < 0:
+                most_chi_square = 2 * (level * gain - score(found[0], gain) + apart * math.log(10))
+                if most_chi_square < 0 or search.is_told_apart(level, found[0], apart):
                     break
-                further = search.level if search.has_rivals(found[0], level, most_chi_square) else search.level_of_twins
+                further = search.level if search.has_rivals(level, most_chi_square) else search.level_of_twins
                 found = distinct([*found, *further(level, most_chi_square, found)], gain)
             least_rods = level
     except _TooManyTriplesError:
         return Found([], least_rods, f"given up after {_MOST_TRIPLES} triples of spots: too many look like the frame")
-    return Found(judged(found, spots, frame, search.seeds_by_visible), least_rods)
+    return Found(judged(found, spots, frame, prior, apart), least_rods)
 
 
 class _TooManyTriplesError(Exception):
@@ -80,38 +94,21 @@ class _Search:
         self._searched_down_to: dict[int, int] = {}
         self._triples = 0
 
-    def seeds_by_visible(self, level: int) -> NDArray[np.int64]:
-        """At v, how many seeds of those found so far have the slice cut v rods besides their own three.
-
-        Only those of the triples that explanations of `level` rods need: each such set of rods is counted once.
-        """
-        total = np.zeros(len(self._frame) - 2, dtype=np.int64)
-        for index, (_, complete_from) in enumerate(self._order):
-            for search in self._searched.get(index, []):
-                total += search.seeds_by_visible
-            if complete_from <= level:
-                break
-        return total
-
     def hopeless(self, level: int) -> bool:
         """Whether even a true match of so many rods would hardly be told from chance."""
-        spots = self._spots
-        least = least_log10_false_alarms(
-            level,
-            len(self._frame),
-            len(spots.mm),
-            self.seeds_by_visible(level),
-            spots.variance_mm2,
-            area_of_uniform_mm2(spots.mm, spots.slice_area_mm2),
-        )
+        least = least_log10_false_alarms(level, self._spots, self._frame, self._prior)
         return least > self._options.max_log10_false_alarms
 
-    def has_rivals(self, best: Hypothesis, level: int, chi_square: float) -> bool:
+    def is_told_apart(self, level: int, best: Hypothesis, apart: float) -> bool:
+        """Whether chance brings matches of so many rods so much more often that they are no rivals of the best."""
+        least = least_log10_false_alarms(level, self._spots, self._frame, self._prior)
+        return least > log10_false_alarms(best, self._spots, self._frame, self._prior) + apart
+
+    def has_rivals(self, level: int, chi_square: float) -> bool:
         """Whether chance may bring explanations of `level` rods, of so low a chi-square, that could be accepted."""
         if self.hopeless(level):
             return False
-        by_chance = log10_by_chance(best, self._spots, self._frame, self.seeds_by_visible(level), level, chi_square)
-        return by_chance > _LOG10_RIVALS
+        return log10_by_chance(level, chi_square, self._spots, self._frame, self._prior) > _LOG10_RIVALS
 
     def level(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """Explanations of so many rods, or more, besides the known; most_chi_square: see `SeedSearch.reaching`."""

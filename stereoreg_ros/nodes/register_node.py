@@ -123,7 +123,8 @@ class RegisterNode(Node):
             return
         try:
             ct_slice = self._slice_from(image, scanner_from_slice)
-            result = register_slice(ct_slice, self._frame, self._settings.options)
+            previous = self._latest.registration.scanner_from_frame if self._latest else None
+            result = register_slice(ct_slice, self._frame, self._settings.options, previous)
             duration_s = time.perf_counter() - started
             status = status_of(result, self._calibration, duration_s, header.frame_id)
         except ValueError as error:

@@ -1,0 +1,128 @@
+"""How many poses a frame may have: their volume, and how large a part of it one arrangement of spots takes up.
+
+The poses that have the slice cut certain rods fill a volume of three millimetres and three radians. A small piece of it
+is moved to a larger or smaller piece of the surface that the poses make in the space of all spot coordinates; the ratio
+of the two is sqrt det J'J, J being the spots' derivative by the pose (see `matching.significance`).
+
+What a slice shows does not change, but for its place and turn in the image, when it is shifted in its plane and turned
+about its normal: only planes have to be drawn, their normals and their heights.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import combinations
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array
+from stereoreg_ros.geometry.projection import cut, cut_jacobian
+from stereoreg_ros.matching.prior import Near, Prior
+from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
+
+_LOG2_PLANES = 14
+# Of more sets of rods than this, so many are drawn.
+_MOST_SETS = 64
+# Percentage of poses whose ratio is lower than the low one.
+_LOW = 1.0
+# Near a pose, spots within reach leave the slice's height so many reaches of room.
+_NEAR_HEIGHTS = 4.0
+
+
+def pose_volume(frame: Frame, rods: int, prior: Prior, area_mm2: float) -> float:
+    """Volume, mm^3 rad^3, of the poses within the prior that have the slice cut so many rods, over all sets of these.
+
+    area_mm2: of the slice, in which all the spots lie.
+    """
+    if prior.near is not None:
+        return _volume_near(frame, rods, prior, prior.near)
+    sample = plane_sample(frame, rods)
+    # The wider a set of spots is, the less room it has in the slice.
+    room = np.maximum(sample.sets * area_mm2 - sample.widths_mm * math.sqrt(area_mm2), 0.0)
+    return sample.weight * float((prior.turns(sample.normals) * room).sum())
+
+
+class PlaneSample(NamedTuple):
+    """Planes (p) in which a slice cuts so many rods of a frame.
+
+    normals: (p, 3); sets: (p,), how many sets of so many rods each cuts; widths_mm: (p,), sum of these sets' widths;
+    weight: volume that a plane stands for, mm rad^2 of the height and the normal. low_ratio, mean_ratio: sqrt det J'J
+    over planes and sets, the one that few are below, and the mean; J in mm per mm and per rad.
+    """
+
+    normals: Array
+    sets: Array
+    widths_mm: Array
+    weight: float
+    low_ratio: float
+    mean_ratio: float
+
+
+@lru_cache(maxsize=64)
+def plane_sample(frame: Frame, rods: int) -> PlaneSample:
+    """Planes with normals evenly over the sphere and heights evenly over the frame; drawn once."""
+    ends = np.concatenate([frame.starts, frame.ends])
+    centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    radius = float(np.linalg.norm(ends - centre, axis=1).max()) + END_SLACK_MM
+    drawn = qmc.Sobol(3, scramble=True, seed=0).random_base2(_LOG2_PLANES)
+    z, turn = 2 * drawn[:, 0] - 1, 2 * np.pi * drawn[:, 1]
+    across = np.sqrt(1 - z**2)
+    normals = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+    rotations = _any_rotations(normals)
+    # The frame's middle is at the slice's origin, but for its height.
+    translations = -(rotations @ centre)
+    translations[:, 2] += radius * (2 * drawn[:, 2] - 1)
+    cuts = cut(frame, rotations, translations)
+    with np.errstate(invalid="ignore"):
+        low, high = frame.lambda_min - END_SLACK_MM, frame.lambda_max + END_SLACK_MM
+        visible = (cuts.lambdas >= low) & (cuts.lambdas <= high)
+        visible &= np.abs(cuts.directions[..., 2]) >= LEAST_COSINE
+    chosen = np.flatnonzero(visible.sum(axis=1) >= rods)
+    visible, points = visible[chosen], cuts.points_mm[chosen]
+    jacobians = cut_jacobian(cuts.take(chosen), translations[chosen])
+    sets, widths, ratios = np.zeros(len(chosen)), np.zeros(len(chosen)), [np.zeros(0)]
+    chosen_sets, share = _sets_of(len(frame), rods)
+    for one in chosen_sets:
+        rows = np.flatnonzero(visible[:, one].all(axis=1))
+        jacobian = jacobians[rows][:, one].reshape(len(rows), 2 * rods, 6)
+        ratios.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(jacobian, 1, 2) @ jacobian), 0.0)))
+        apart = np.linalg.norm(points[rows][:, one, None] - points[rows][:, None, one], axis=-1)
+        sets[rows] += share
+        widths[rows] += share * apart.max(axis=(1, 2), initial=0.0)
+    all_ratios = np.concatenate(ratios)
+    low_ratio, mean_ratio = (np.percentile(all_ratios, _LOW), all_ratios.mean()) if all_ratios.size else (0.0, 0.0)
+    weight = 4 * np.pi * 2 * radius / len(normals)
+    return PlaneSample(normals[chosen], sets, widths, weight, float(low_ratio), float(mean_ratio))
+
+
+def _sets_of(lines: int, rods: int) -> tuple[list[NDArray[np.intp]], float]:
+    """Sets of so many lines, and how many each stands for."""
+    if comb(lines, rods) <= _MOST_SETS:
+        return [np.array(one) for one in combinations(range(lines), rods)], 1.0
+    rng = np.random.default_rng(0)
+    return [rng.permutation(lines)[:rods] for _ in range(_MOST_SETS)], comb(lines, rods) / _MOST_SETS
+
+
+def _any_rotations(normals: Array) -> Array:
+    """Rotations (p, 3, 3), slice_from_frame, with the slice's normal at `normals` (p, 3) in the frame."""
+    aside = np.where(np.abs(normals[:, :1]) < 0.7, np.eye(3)[0], np.eye(3)[1])
+    first = np.cross(aside, normals)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    rotations: Array = np.stack([first, np.cross(normals, first), normals], axis=1)
+    return rotations
+
+
+def _volume_near(frame: Frame, rods: int, prior: Prior, near: Near) -> float:
+    cuts = cut(frame, prior.rotation, near.translation)
+    with np.errstate(invalid="ignore"):
+        slack = END_SLACK_MM + _NEAR_HEIGHTS * near.reach_mm / 2
+        visible = (cuts.lambdas >= frame.lambda_min - slack) & (cuts.lambdas <= frame.lambda_max + slack)
+        visible &= np.abs(cuts.directions[:, 2]) >= LEAST_COSINE
+    room = math.pi * near.reach_mm**2 * _NEAR_HEIGHTS * near.reach_mm
+    return comb(int(visible.sum()), rods) * room * 4 / 3 * math.pi * prior.max_rotation**3
