@@ -162,6 +162,8 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
     They must come near the best one in likelihood, and in how rare they are by chance: from a few spots of the frame's
     own, chance soon makes a match of one or two rods less.
     """
+    if not found:
+        return []
     gain = spots.gain(frame)
     rivals = [
         replace(one, log10_false_alarms=log10_false_alarms(one, spots, frame, prior))

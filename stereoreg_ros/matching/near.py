@@ -10,9 +10,11 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching import three_line
-from stereoreg_ros.matching.consensus import Spots
-from stereoreg_ros.matching.hypothesis import UNMATCHED, Found
+from stereoreg_ros.matching.consensus import Spots, decades_apart, judged
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Near, Prior
+from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.options import RegistrationOptions
 
 # How far a spot may lie from where the known pose has its rod cut the slice, and the frame may have turned. What moved
@@ -33,17 +35,29 @@ def match_near(
     cuts = cut(frame, guess_slice_from_frame.rotation, guess_slice_from_frame.translation)
     offset = spots.mm[None] - cuts.points_mm[:, None]
     with np.errstate(invalid="ignore"):
+        offset[~np.isfinite(offset)] = np.inf  # of a rod that runs within the slice
         within_reach = (offset**2).sum(axis=-1) <= _REACH_MM**2
     reach = Near(guess_slice_from_frame.translation, _REACH_MM, within_reach)
     near = Prior(guess_slice_from_frame.rotation, _MAX_ROTATION, reach)
-    found = three_line.match(spots, frame, near, options)
-    if found.given_up or len(found.hypotheses) != 1:
+    # Most often each rod's spot is the nearest one; where that leads to no explanation of all rods, seeds are sought.
+    nearest = np.where(within_reach.any(axis=1), (offset**2).sum(axis=-1).argmin(axis=1), UNMATCHED)
+    taken = nearest[nearest != UNMATCHED]
+    found: list[Hypothesis] = []
+    if len(taken) >= options.min_inliers and len(np.unique(taken)) == len(taken):
+        start = Starts(near.rotation[None], reach.translation[None], nearest[None], np.zeros(1, dtype=np.intp))
+        found = [one for one in settle(spots, frame, start, options.min_inliers) if one.missing == 0]
+        found = judged(found, spots, frame, near, decades_apart(options))
+    if not found:
+        found = three_line.match_most(spots, frame, near, options)
+    if len(found) != 1:
         return None
-    best = found.hypotheses[0]
+    best = found[0]
+    is_near = near.angles(best.rotation) <= near.max_rotation
     allowed = prior.angles(best.rotation) <= prior.max_rotation
-    if not allowed or best.log10_false_alarms > options.max_log10_false_alarms:
+    if not (is_near and allowed) or best.log10_false_alarms > options.max_log10_false_alarms:
         return None
-    rows = np.sort(best.spot_of_line[best.spot_of_line != UNMATCHED])
-    own = np.where(best.spot_of_line != UNMATCHED, np.searchsorted(rows, best.spot_of_line), UNMATCHED)
-    twins = three_line.match(spots.only(rows), frame, prior, options, known=[replace(best, spot_of_line=own)])
-    return None if twins.given_up or len(twins.hypotheses) != 1 else found
+    matched = best.spot_of_line != UNMATCHED
+    rows = np.sort(best.spot_of_line[matched])
+    own = replace(best, spot_of_line=np.where(matched, np.searchsorted(rows, best.spot_of_line), UNMATCHED))
+    twins = three_line.match(spots.only(rows), frame, prior, options, known=[own])
+    return None if twins.given_up or len(twins.hypotheses) != 1 else Found(found, best.inliers)

@@ -63,7 +63,7 @@ def match(
     found = list(known)
     least_rods = len(frame) + 1
     try:
-        for level in range(min(len(frame), len(spots.mm)), options.min_inliers - 1, -1):
+        for level in search.levels:
             if not found:
                 if search.hopeless(level):
                     break
@@ -80,6 +80,21 @@ def match(
     return Found(judged(found, spots, frame, prior, apart), least_rods)
 
 
+def match_most(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> list[Hypothesis]:
+    """The explanations of the most rods, and rivals of as many; none where there is none, or the search is long."""
+    search = _Search(spots, frame, prior, options)
+    try:
+        for level in search.levels:
+            if search.hopeless(level):
+                break
+            found = distinct(list(search.level(level, math.inf, [])), spots.gain(frame))
+            if found:
+                return judged(found, spots, frame, prior, decades_apart(options))
+    except _TooManyTriplesError:
+        pass
+    return []
+
+
 class _TooManyTriplesError(Exception):
     """A search goes on for too long."""
 
@@ -93,6 +108,11 @@ class _Search:
         self._searched: dict[int, list[SeedSearch]] = {}
         self._searched_down_to: dict[int, int] = {}
         self._triples = 0
+
+    @property
+    def levels(self) -> range:
+        """Numbers of rods to seek, most first."""
+        return range(min(len(self._frame), len(self._spots.mm)), self._options.min_inliers - 1, -1)
 
     def hopeless(self, level: int) -> bool:
         """Whether even a true match of so many rods would hardly be told from chance."""
