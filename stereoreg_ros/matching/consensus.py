@@ -14,7 +14,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
-from stereoreg_ros.matching.pose_volume import plane_sample, pose_volume
+from stereoreg_ros.matching.pose_volume import low_stretch, plane_sample, pose_volume, stretch
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.significance import (
     Chance,
@@ -36,18 +36,6 @@ _LARGEST_VALLEY = 0.5
 _FAR_BEHIND = 30.0
 # Explanations are never held to be told apart by less than this many decades of likelihood.
 _LEAST_DECADES_APART = 1.0
-# Spots do not leave a direction of the pose wholly open: where they do so to first order, the second bounds it. Stated
-# as standard deviations: of a rotation in rad, of a position in mm.
-_OPEN_ROTATION = 0.1
-_OPEN_POSITION = 10.0
-# Spots do not leave a direction of the pose wholly open: where they do so to first order, the second bounds it. Stated
-# as standard deviations: of a rotation in rad, of a position in mm.
-_OPEN_ROTATION = 0.1
-_OPEN_POSITION = 10.0
-# A likelihood ratio, as log, by which explanations count as told apart; a thousand to one.
-TOLD_APART = 6.9
-
-
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
 MISSING_COST = 3.0
 
@@ -177,10 +165,8 @@ def log10_false_alarms(hypothesis: Hypothesis, spots: Spots, frame: Frame, prior
     """log10 of how many explanations as good as this one chance brings, over its share of those that are allowed."""
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
-    jacobian = (spots.whitening @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
-    openness = np.diag([_OPEN_POSITION**-2] * 3 + [_OPEN_ROTATION**-2] * 3)
-    determinant = float(np.linalg.det(jacobian.T @ jacobian + openness))
-    ratio = math.sqrt(determinant) * spots.variance_mm2**3
+    jacobian = cut_jacobian(cuts, hypothesis.translation)[lines].reshape(-1, 6)
+    ratio = float(stretch(jacobian.T @ jacobian, spots.variance_mm2))
     area_mm2 = clutter_area_mm2(spots.mm, hypothesis.spot_of_line[lines], spots.slice_area_mm2)
     volume = pose_volume(frame, len(lines), prior, area_mm2)
     chance = Chance(len(spots.mm), area_mm2, spots.variance_mm2, ratio * volume)
@@ -189,7 +175,7 @@ def log10_false_alarms(hypothesis: Hypothesis, spots: Spots, frame: Frame, prior
 
 def least_log10_false_alarms(inliers: int, spots: Spots, frame: Frame, prior: Prior) -> float:
     """What `log10_false_alarms` of a true explanation of so many rods is hardly ever below."""
-    ratio = plane_sample(frame, inliers).low_ratio
+    ratio = low_stretch(frame, inliers, spots.variance_mm2)
     value = log10_expected(inliers, lucky_chi_square(inliers), _chance(inliers, ratio, spots, frame, prior))
     return value - math.log10(share_of(inliers, len(frame)))
 

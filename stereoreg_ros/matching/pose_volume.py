@@ -29,8 +29,10 @@ from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 _LOG2_PLANES = 14
 # Of more sets of rods than this, so many are drawn.
 _MOST_SETS = 64
-# Percentage of poses whose ratio is lower than the low one.
-_LOW = 1.0
+# Of so many planes J'J is kept; and the percentage of them whose stretch is lower than the low one.
+_FEW, _LOW = 400, 2.0
+# Stated as standard deviations: how far a position, in mm, or a rotation, in rad, is left open at most.
+_OPEN_POSITION_MM, _OPEN_ROTATION = 10.0, 0.1
 # Near a pose, spots within reach leave the slice's height so many reaches of room.
 _NEAR_HEIGHTS = 4.0
 
@@ -52,16 +54,16 @@ class PlaneSample(NamedTuple):
     """Planes (p) in which a slice cuts so many rods of a frame.
 
     normals: (p, 3); sets: (p,), how many sets of so many rods each cuts; widths_mm: (p,), sum of these sets' widths;
-    weight: volume that a plane stands for, mm rad^2 of the height and the normal. low_ratio, mean_ratio: sqrt det J'J
-    over planes and sets, the one that few are below, and the mean; J in mm per mm and per rad.
+    weight: volume that a plane stands for, mm rad^2 of the height and the normal. mean_ratio: of sqrt det J'J over
+    planes and sets; squares: (m, 6, 6), J'J of some of them; J in mm per mm and per rad.
     """
 
     normals: Array
     sets: Array
     widths_mm: Array
     weight: float
-    low_ratio: float
     mean_ratio: float
+    squares: Array
 
 
 @lru_cache(maxsize=64)
@@ -86,19 +88,39 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
     chosen = np.flatnonzero(visible.sum(axis=1) >= rods)
     visible, points = visible[chosen], cuts.points_mm[chosen]
     jacobians = cut_jacobian(cuts.take(chosen), translations[chosen])
+    squares = [np.zeros((0, 6, 6))]
     sets, widths, ratios = np.zeros(len(chosen)), np.zeros(len(chosen)), [np.zeros(0)]
     chosen_sets, share = _sets_of(len(frame), rods)
     for one in chosen_sets:
         rows = np.flatnonzero(visible[:, one].all(axis=1))
         jacobian = jacobians[rows][:, one].reshape(len(rows), 2 * rods, 6)
-        ratios.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(jacobian, 1, 2) @ jacobian), 0.0)))
+        square = np.swapaxes(jacobian, 1, 2) @ jacobian
+        ratios.append(np.sqrt(np.maximum(np.linalg.det(square), 0.0)))
+        squares.append(square[:: max(1, len(square) * len(chosen_sets) // _FEW)])
         apart = np.linalg.norm(points[rows][:, one, None] - points[rows][:, None, one], axis=-1)
         sets[rows] += share
         widths[rows] += share * apart.max(axis=(1, 2), initial=0.0)
-    all_ratios = np.concatenate(ratios)
-    low_ratio, mean_ratio = (np.percentile(all_ratios, _LOW), all_ratios.mean()) if all_ratios.size else (0.0, 0.0)
     weight = 4 * np.pi * 2 * radius / len(normals)
-    return PlaneSample(normals[chosen], sets, widths, weight, float(low_ratio), float(mean_ratio))
+    mean_ratio = float(np.concatenate(ratios).mean()) if sets.any() else 0.0
+    return PlaneSample(normals[chosen], sets, widths, weight, mean_ratio, np.concatenate(squares))
+
+
+def stretch(squares: Array, variance_mm2: float) -> Array:
+    """sqrt det J'J (...) of J'J (..., 6, 6), for spots of that variance, mm^2.
+
+    Spots do not leave a direction of the pose wholly open: where they do so to first order, the second bounds it.
+    """
+    openness = np.diag([_OPEN_POSITION_MM**-2] * 3 + [_OPEN_ROTATION**-2] * 3)
+    determinant = np.linalg.det(squares / variance_mm2 + openness)
+    ratio: Array = np.sqrt(np.maximum(determinant, 0.0)) * variance_mm2**3
+    return ratio
+
+
+@lru_cache(maxsize=256)
+def low_stretch(frame: Frame, rods: int, variance_mm2: float) -> float:
+    """What few poses' stretch is below."""
+    ratios = stretch(plane_sample(frame, rods).squares, variance_mm2)
+    return float(np.percentile(ratios, _LOW)) if ratios.size else 0.0
 
 
 def _sets_of(lines: int, rods: int) -> tuple[list[NDArray[np.intp]], float]:

@@ -64,10 +64,10 @@ def match(
     least_rods = len(frame) + 1
     try:
         for level in search.levels:
-            if not found:
+            if not found or not search.is_acceptable(found[0]):
                 if search.hopeless(level):
                     break
-                found = distinct(list(search.level(level, math.inf, [])), gain)
+                found = distinct([*found, *search.level(level, math.inf, found)], gain)
             else:
                 most_chi_square = 2 * (level * gain - score(found[0], gain) + apart * math.log(10))
                 if most_chi_square < 0 or search.is_told_apart(level, found[0], apart):
@@ -113,6 +113,11 @@ class _Search:
     def levels(self) -> range:
         """Numbers of rods to seek, most first."""
         return range(min(len(self._frame), len(self._spots.mm)), self._options.min_inliers - 1, -1)
+
+    def is_acceptable(self, hypothesis: Hypothesis) -> bool:
+        """Whether chance is ruled out as an explanation of the explanation."""
+        value = log10_false_alarms(hypothesis, self._spots, self._frame, self._prior)
+        return value <= self._options.max_log10_false_alarms
 
     def hopeless(self, level: int) -> bool:
         """Whether even a true match of so many rods would hardly be told from chance."""
