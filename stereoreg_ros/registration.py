@@ -38,6 +38,13 @@ _IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
 _WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 1.0, 1.0
 
 
+def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:
+    """Fill the tables that most slices with `frame` need, in a second or two; else the first slices wait for them."""
+    options = options or RegistrationOptions()
+    if options.matcher == "three_line":
+        three_line.prepare(frame, _noise_mm(scale, options.spot_noise_px), options)
+
+
 def register_slice(
     ct_slice: Slice, frame: Frame, options: RegistrationOptions | None = None, previous: Pose | None = None
 ) -> Registration | Refusal:
@@ -180,10 +187,14 @@ def _prepare(spots_px: Array, scale: PixelScale, noise_px: float, slice_area_mm2
     return Spots(
         mm=mm,
         whitening=scale.inverse_matrix / noise_px,
-        sigma_mm=noise_px * max(scale.sx, scale.sy),
+        sigma_mm=_noise_mm(scale, noise_px),
         variance_mm2=noise_px**2 * scale.sx * scale.sy,
         slice_area_mm2=slice_area_mm2,
     )
+
+
+def _noise_mm(scale: PixelScale, noise_px: float) -> float:
+    return noise_px * max(scale.sx, scale.sy)
 
 
 def _estimate(

@@ -33,6 +33,8 @@ _MOST_SETS = 64
 _FEW, _LOW = 400, 2.0
 # Stated as standard deviations: how far a position, in mm, or a rotation, in rad, is left open at most.
 _OPEN_POSITION_MM, _OPEN_ROTATION = 10.0, 0.1
+# Over so many turns of a quarter circle boxes are averaged.
+_TURNS = 6
 # Near a pose, spots within reach leave the slice's height so many reaches of room.
 _NEAR_HEIGHTS = 4.0
 
@@ -45,15 +47,17 @@ def pose_volume(frame: Frame, rods: int, prior: Prior, area_mm2: float) -> float
     if prior.near is not None:
         return _volume_near(frame, rods, prior, prior.near)
     sample = plane_sample(frame, rods)
-    # The wider a set of spots is, the less room it has in the slice.
-    room = np.maximum(sample.sets * area_mm2 - sample.widths_mm * math.sqrt(area_mm2), 0.0)
+    # The wider a set of spots is, the less room it has in the slice, which is taken to be a square.
+    room = sample.sets * area_mm2 - sample.widths_mm * math.sqrt(area_mm2) + sample.boxes_mm2
+    room = np.maximum(room, 0.0)
     return sample.weight * float((prior.turns(sample.normals) * room).sum())
 
 
 class PlaneSample(NamedTuple):
     """Planes (p) in which a slice cuts so many rods of a frame.
 
-    normals: (p, 3); sets: (p,), how many sets of so many rods each cuts; widths_mm: (p,), sum of these sets' widths;
+    normals: (p, 3); sets: (p,), how many sets of so many rods each cuts; widths_mm, boxes_mm2: (p,), sums over these
+    sets of width and height together, and of width times height, of the box around the spots, averaged over turns;
     weight: volume that a plane stands for, mm rad^2 of the height and the normal. mean_ratio: of sqrt det J'J over
     planes and sets; squares: (m, 6, 6), J'J of some of them; J in mm per mm and per rad.
     """
@@ -61,6 +65,7 @@ class PlaneSample(NamedTuple):
     normals: Array
     sets: Array
     widths_mm: Array
+    boxes_mm2: Array
     weight: float
     mean_ratio: float
     squares: Array
@@ -89,7 +94,10 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
     visible, points = visible[chosen], cuts.points_mm[chosen]
     jacobians = cut_jacobian(cuts.take(chosen), translations[chosen])
     squares = [np.zeros((0, 6, 6))]
-    sets, widths, ratios = np.zeros(len(chosen)), np.zeros(len(chosen)), [np.zeros(0)]
+    ratios = [np.zeros(0)]
+    sets, widths, boxes = (np.zeros(len(chosen)) for _ in range(3))
+    turned = np.pi / 2 * np.arange(2 * _TURNS) / _TURNS
+    along = points @ np.stack([np.cos(turned), np.sin(turned)])  # (planes, rods, turns)
     chosen_sets, share = _sets_of(len(frame), rods)
     for one in chosen_sets:
         rows = np.flatnonzero(visible[:, one].all(axis=1))
@@ -97,12 +105,14 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
         square = np.swapaxes(jacobian, 1, 2) @ jacobian
         ratios.append(np.sqrt(np.maximum(np.linalg.det(square), 0.0)))
         squares.append(square[:: max(1, len(square) * len(chosen_sets) // _FEW)])
-        apart = np.linalg.norm(points[rows][:, one, None] - points[rows][:, None, one], axis=-1)
+        extent = np.ptp(along[rows][:, one], axis=1)
+        width, height = extent[:, :_TURNS], extent[:, _TURNS:]
         sets[rows] += share
-        widths[rows] += share * apart.max(axis=(1, 2), initial=0.0)
+        widths[rows] += share * (width + height).mean(axis=1)
+        boxes[rows] += share * (width * height).mean(axis=1)
     weight = 4 * np.pi * 2 * radius / len(normals)
     mean_ratio = float(np.concatenate(ratios).mean()) if sets.any() else 0.0
-    return PlaneSample(normals[chosen], sets, widths, weight, mean_ratio, np.concatenate(squares))
+    return PlaneSample(normals[chosen], sets, widths, boxes, weight, mean_ratio, np.concatenate(squares))
 
 
 def stretch(squares: Array, variance_mm2: float) -> Array:

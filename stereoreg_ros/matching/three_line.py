@@ -26,6 +26,7 @@ from stereoreg_ros.matching.consensus import (
     score,
 )
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.pose_volume import plane_sample
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, search_seeds
 from stereoreg_ros.matching.settling import settle
@@ -168,7 +169,7 @@ class _Search:
         if level < down_to:
             if self._triples > _MOST_TRIPLES:
                 raise _TooManyTriplesError
-            solver = _solver(self._frame, self._order[index].lines, round(6.0 * self._spots.sigma_mm + 0.05, 1))
+            solver = _solver(self._frame, self._order[index].lines, _tolerance_mm(self._spots.sigma_mm))
             search = search_seeds(
                 self._spots, self._frame, solver, (level, down_to - 1), self._prior, self._options.min_inliers
             )
@@ -176,6 +177,24 @@ class _Search:
             self._searched.setdefault(index, []).append(search)
             self._searched_down_to[index] = level
         return self._searched[index]
+
+
+def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> None:
+    """Fill the tables that most slices need, in which all rods show or all but one; sigma_mm: of the spots' centres."""
+    most, least = len(frame), max(len(frame) - 1, options.min_inliers)
+    for lines, complete_from in triple_order(frame, options.min_inliers):
+        solver = _solver(frame, lines, _tolerance_mm(sigma_mm))
+        for range_of_rods in ((most, most), (least, most), (least, least)):
+            solver.table(*range_of_rods)
+        if complete_from <= least:
+            break
+    for rods in range(options.min_inliers, most + 1):
+        plane_sample(frame, rods)
+
+
+def _tolerance_mm(sigma_mm: float) -> float:
+    """How far noise may change a distance between two spots; in steps, so that few solvers serve all noises."""
+    return round(6.0 * sigma_mm + 0.05, 1)
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,130 @@
+"""A guess of the pose: it helps where it is right, and costs no safety where it is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_spots
+from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
+from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_pose, random_spot_set
+
+SCANNER = ScannerSettings()
+SCALE = SCANNER.scale
+CUBE = load_frame("cube6")
+
+
+def moved(rng: np.random.Generator, pose: Pose, mm: float, degrees: float) -> Pose:
+    """The pose, as much as that away in a random direction."""
+    step, axis = rng.normal(size=(2, 3))
+    return pose.perturbed(mm * step / np.linalg.norm(step), np.radians(degrees) * axis / np.linalg.norm(axis))
+
+
+def is_wrong(found: Pose, truth: Pose) -> bool:
+    turn = np.degrees(rotation_angle(found.rotation @ truth.rotation.T))
+    return bool(np.linalg.norm(found.translation - truth.translation) > 2.0 or turn > 3.0)
+
+
+@pytest.mark.parametrize(("mm", "degrees"), [(0.5, 0.3), (4.0, 2.0)])
+def test_five_rods_among_thirty_spots_are_sure_near_the_pose_before(mm: float, degrees: float) -> None:
+    rng = np.random.default_rng(1)
+    settings = SpotSetSettings(SCANNER, visible_rods=5, false_spots=25, noise_px=0.5)
+    options = RegistrationOptions(spot_noise_px=settings.noise_std_px)
+    told, untold = 0, 0
+    for _ in range(60):
+        problem = random_spot_set(rng, CUBE, settings)
+        guess = moved(rng, problem.slice_from_frame, mm, degrees)
+        result = register_spots(problem.spots_px, CUBE, SCALE, options, previous=guess)
+        told += bool(result)
+        if result:
+            assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame)
+        untold += bool(register_spots(problem.spots_px, CUBE, SCALE, options))
+    assert told >= 59
+    assert untold < 30
+
+
+def test_says_the_same_as_without_a_guess() -> None:
+    rng = np.random.default_rng(2)
+    settings = SpotSetSettings(SCANNER, visible_rods=6, false_spots=12, noise_px=0.3)
+    for _ in range(20):
+        problem = random_spot_set(rng, CUBE, settings)
+        alone = register_spots(problem.spots_px, CUBE, SCALE)
+        guided = register_spots(problem.spots_px, CUBE, SCALE, previous=moved(rng, problem.slice_from_frame, 3.0, 2.0))
+        assert alone
+        assert guided
+        assert [match.spot for match in alone.matches] == [match.spot for match in guided.matches]
+        np.testing.assert_allclose(
+            guided.scanner_from_frame.translation, alone.scanner_from_frame.translation, atol=1e-4
+        )
+        # Far fewer poses could have been meant.
+        assert guided.estimate.log10_false_alarms < alone.estimate.log10_false_alarms - 2
+
+
+def test_a_wrong_guess_does_no_harm() -> None:
+    rng = np.random.default_rng(3)
+    settings = SpotSetSettings(SCANNER, visible_rods=6, false_spots=12, noise_px=0.3)
+    for mm, degrees in ((30.0, 0.0), (0.0, 20.0), (200.0, 170.0)):
+        for _ in range(10):
+            problem = random_spot_set(rng, CUBE, settings)
+            guess = moved(rng, problem.slice_from_frame, mm, degrees)
+            result = register_spots(problem.spots_px, CUBE, SCALE, previous=guess)
+            assert result
+            assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame)
+
+
+def test_clutter_is_not_taken_for_the_frame_that_was_there() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(150):
+        guess = random_pose(rng, CUBE, SCANNER)
+        spots = rng.uniform(0, 512, (rng.integers(5, 40), 2))
+        assert not register_spots(spots, CUBE, SCALE, previous=guess)
+
+
+@pytest.mark.parametrize("name", ["zframe", "leksell_ct"])
+def test_twins_are_found_far_from_the_guess(name: str) -> None:
+    frame = load_frame(name)
+    scanner = ScannerSettings(shape=(640, 640))
+    rng = np.random.default_rng(5)
+    for _ in range(6):
+        truth = random_pose(rng, frame, scanner, max_tilt_deg=4.0, max_offset_mm=10.0, max_depth_mm=15.0)
+        spots, _ = project(frame, truth, SCALE)
+        result = register_spots(spots + rng.normal(0, 0.2, spots.shape), frame, SCALE, previous=truth)
+        assert not result
+        assert result.reason == "ambiguous"
+
+
+def test_the_orientation_that_is_allowed_holds_near_a_guess_too() -> None:
+    rng = np.random.default_rng(6)
+    truth = random_pose(rng, CUBE, SCANNER)
+    spots, _ = project(CUBE, truth, SCALE)
+    elsewhere = Pose(rotation_exp(np.array([0.0, 0.0, 2.0])) @ truth.rotation, np.zeros(3)).quaternion_xyzw
+    options = RegistrationOptions(nominal_orientation=tuple(elsewhere), max_rotation_deg=30.0)
+    assert register_spots(spots, CUBE, SCALE, previous=truth)
+    assert not register_spots(spots, CUBE, SCALE, options, previous=truth)
+
+
+def test_guesses_that_make_no_sense() -> None:
+    rng = np.random.default_rng(7)
+    truth = random_pose(rng, CUBE, SCANNER)
+    spots, _ = project(CUBE, truth, SCALE)
+    flat = rotation_exp(np.array([np.pi / 2, 0.0, 0.0]))  # rods within the slice, or nearly
+    for guess in (Pose(flat, truth.translation), Pose(flat, np.full(3, 1e6)), Pose.identity()):
+        result = register_spots(spots, CUBE, SCALE, previous=guess)
+        assert result
+        assert not is_wrong(result.scanner_from_frame, truth)
+    assert not register_spots(np.full((8, 2), 100.0), CUBE, SCALE, previous=truth)
+
+
+def test_the_guess_is_in_the_scanner() -> None:
+    rng = np.random.default_rng(8)
+    truth = random_pose(rng, CUBE, SCANNER)
+    spots, _ = project(CUBE, truth, SCALE)
+    scanner_from_slice = Pose(rotation_exp(np.array([0.2, 0.5, -1.0])), np.array([10.0, -300.0, 55.0]))
+    expected = scanner_from_slice @ truth
+    near = register_spots(spots, CUBE, SCALE, None, scanner_from_slice, previous=expected)
+    far = register_spots(spots, CUBE, SCALE, None, scanner_from_slice, previous=truth)
+    assert near
+    assert far
+    assert near.estimate.log10_false_alarms < far.estimate.log10_false_alarms - 2
+    np.testing.assert_allclose(near.scanner_from_frame.translation, expected.translation, atol=1e-5)
