@@ -37,8 +37,12 @@ from stereoreg_ros.solvers.three_lines import ThreeLineSolver
 
 # Hypotheses refined at once: bounds the memory.
 _CHUNK = 4000
-# Triples of spots after which a search is given up: some seconds. Only clutter takes so many.
-_MOST_TRIPLES = 6_000_000
+# Work after which a search is given up: some seconds. Only clutter takes so much. The unit is what a triple of spots
+# takes with six rods; so much more takes a start that is refined, with six rods and few spots, and the search of a
+# triple of rods by itself.
+_MOST_WORK = 6_000_000
+_WORK_OF_START, _WORK_OF_SEARCH = 40, 100_000
+_FEW_SPOTS = 30
 # Explanations that chance brings less often than this (log10) are not sought beside one that was found.
 _LOG10_RIVALS = -3.0
 
@@ -76,8 +80,8 @@ def match(
                 further = search.level if search.has_rivals(level, most_chi_square) else search.level_of_twins
                 found = distinct([*found, *further(level, most_chi_square, found)], gain)
             least_rods = level
-    except _TooManyTriplesError:
-        return Found([], least_rods, f"given up after {_MOST_TRIPLES} triples of spots: too many look like the frame")
+    except _TooMuchWorkError:
+        return Found([], least_rods, "given up: too many of them look like parts of the frame")
     return Found(judged(found, spots, frame, prior, apart), least_rods)
 
 
@@ -91,12 +95,12 @@ def match_most(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOp
             found = distinct(list(search.level(level, math.inf, [])), spots.gain(frame))
             if found:
                 return judged(found, spots, frame, prior, decades_apart(options))
-    except _TooManyTriplesError:
+    except _TooMuchWorkError:
         pass
     return []
 
 
-class _TooManyTriplesError(Exception):
+class _TooMuchWorkError(Exception):
     """A search goes on for too long."""
 
 
@@ -108,7 +112,7 @@ class _Search:
         self._order = triple_order(frame, options.min_inliers)
         self._searched: dict[int, list[SeedSearch]] = {}
         self._searched_down_to: dict[int, int] = {}
-        self._triples = 0
+        self._work = 0.0
 
     @property
     def levels(self) -> range:
@@ -141,6 +145,7 @@ class _Search:
         for index, (_, complete_from) in enumerate(self._order):
             for seeds in self._seeds(index, level):
                 starts = seeds.reaching(level, most_chi_square, known)
+                self._spend(_WORK_OF_START * starts.spot_of_line.size / 6 * (1 + len(self._spots.mm) / _FEW_SPOTS))
                 for first in range(0, len(starts.spot_of_line), _CHUNK):
                     part = starts.take(slice(first, first + _CHUNK))
                     for hypothesis in settle(self._spots, self._frame, part, self._options.min_inliers):
@@ -163,17 +168,21 @@ class _Search:
             matched = twin.spot_of_line != UNMATCHED
             yield replace(twin, spot_of_line=np.where(matched, rows[twin.spot_of_line], UNMATCHED))
 
+    def _spend(self, work: float) -> None:
+        self._work += work
+        if self._work > _MOST_WORK:
+            raise _TooMuchWorkError
+
     def _seeds(self, index: int, level: int) -> list[SeedSearch]:
         """The seeds of the triple at `index` of the order where a slice may cut `level` rods or more."""
         down_to = self._searched_down_to.get(index, len(self._frame) + 1)
         if level < down_to:
-            if self._triples > _MOST_TRIPLES:
-                raise _TooManyTriplesError
+            self._spend(_WORK_OF_SEARCH)
             solver = _solver(self._frame, self._order[index].lines, _tolerance_mm(self._spots.sigma_mm))
             search = search_seeds(
                 self._spots, self._frame, solver, (level, down_to - 1), self._prior, self._options.min_inliers
             )
-            self._triples += search.triples
+            self._spend(search.triples * len(self._frame) / 6)
             self._searched.setdefault(index, []).append(search)
             self._searched_down_to[index] = level
         return self._searched[index]
