@@ -8,6 +8,9 @@ import pytest
 from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.matching import three_line
+from stereoreg_ros.matching.consensus import Spots
+from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_pose, random_spot_set
 
 SCANNER = ScannerSettings()
@@ -128,3 +131,19 @@ def test_the_guess_is_in_the_scanner() -> None:
     assert far
     assert near.estimate.log10_false_alarms < far.estimate.log10_false_alarms - 2
     np.testing.assert_allclose(near.scanner_from_frame.translation, expected.translation, atol=1e-5)
+
+
+def test_twins_of_what_is_known_are_sought_even_where_chance_is_not_ruled_out() -> None:
+    """A pose that is sure near a guess may not be sure by its spots alone; its twins must be found all the same."""
+    frame = load_frame("zframe")
+    truth = random_pose(np.random.default_rng(9), frame, SCANNER, max_tilt_deg=4.0, max_offset_mm=10.0)
+    spots_px, _ = project(frame, truth, SCALE)
+    mm = SCALE.to_mm(spots_px)
+    spots = Spots(mm, SCALE.inverse_matrix / 0.3, 0.15, 0.15**2, 256.0**2)
+    prior = Prior(np.eye(3), np.pi)
+    every = three_line.match(spots, frame, prior, RegistrationOptions()).hypotheses
+    assert len(every) == 2
+    strict = RegistrationOptions(max_log10_false_alarms=-300.0)
+    again = three_line.match(spots, frame, prior, strict, known=every[:1]).hypotheses
+    # So strict a caller is told of more: of those of all rods, the twin must be one.
+    assert sum(one.inliers == 7 for one in again) == 2

@@ -54,7 +54,8 @@ def match(
     options: RegistrationOptions,
     known: Sequence[Hypothesis] = (),
 ) -> Found:
-    """All explanations of the spots that the best one does not rule out; known: some of them, not sought again.
+    """All explanations of the spots that the best one does not rule out; known: some of them, best first, accepted
+    elsewhere and not sought again.
 
     Explanations of all rods are sought first, then of all but one, and so on. At each level every set of so many rods
     holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots. Where
@@ -69,7 +70,8 @@ def match(
     least_rods = len(frame) + 1
     try:
         for level in search.levels:
-            if not found or not search.is_acceptable(found[0]):
+            # What is known has been accepted by who knows it: its twins are sought however it looks from here.
+            if not known and (not found or not search.is_acceptable(found[0])):
                 if search.hopeless(level):
                     break
                 found = distinct([*found, *search.level(level, math.inf, found)], gain)
