@@ -85,8 +85,9 @@ lint: $(INSTALLED)
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
+# On one core: matrices of six rods gain nothing from several.
 bench: venv
-	.venv/bin/python -m benchmarks $(BENCH_ARGS)
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 .venv/bin/python -m benchmarks $(BENCH_ARGS)
 
 clean:
 	rm -rf build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from benchmarks.matching import BASELINE_FALSE_SPOTS, PROBLEMS, measure, measure_baseline
-from benchmarks.yardstick import seconds_of, yardstick
+from benchmarks.yardstick import Yardstick, seconds_of
 from stereoreg_ros import RegistrationOptions, load_frame
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 from stereoreg_ros.spots import find_spots
@@ -31,7 +31,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("build/bench.json"), help="JSON file to write")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    unit = yardstick()
+    unit = Yardstick().unit()
     finding = _spot_finding()
     print(f"Y = {1e3 * unit:.2f} ms: threshold and connected components of a 512 x 512 slice")
     print(f"finding the spots of such a slice: {finding / unit:.1f} Y\n")
@@ -48,7 +48,7 @@ def main() -> int:
             f"{problem.frame:10s} {problem.visible:5d}  {problem.false_spots:5d}  {problem.noise_px:8.2f}  "
             f"{problem.max_log10:7.0f}  {problem.max_rotation_deg:9.0f}  {guess:5s}  "
             f"{row.right:6d} {row.weak:5d} {row.wrong:6d}  "
-            f"{sum(row.refused.values()):7d}  {row.median_s / unit:8.1f} {row.p99_s / unit:7.1f}  "
+            f"{sum(row.refused.values()):7d}  {row.median_s / row.unit_s:8.1f} {row.p99_s / row.unit_s:7.1f}  "
             f"{1e3 * row.median_s:9.1f}   {row.refused or ''}",
             flush=True,
         )

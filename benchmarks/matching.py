@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from benchmarks.yardstick import Yardstick
 from stereoreg_ros import Pose, Registration, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, rotation_angle
@@ -71,6 +72,7 @@ PROBLEMS = (
 class Row:
     """What a class of problems gave; times in seconds.
 
+    unit_s: the yardstick meanwhile, once after each problem.
     weak: accepted with a caution, and off by more than WRONG_MM or WRONG_DEG, but as the stated covariance says.
     """
 
@@ -81,6 +83,7 @@ class Row:
     refused: dict[str, int]
     median_s: float
     p99_s: float
+    unit_s: float
 
 
 def frame_named(name: str) -> Frame:
@@ -131,6 +134,7 @@ def measure(problem: Problem, trials: int) -> Row:
     )
     rng = np.random.default_rng(1)
     prepare(frame, scanner.scale, options)
+    yardstick, units = Yardstick(), []
     times, right, weak, wrong = [], 0, 0, 0
     refused: Counter[str] = Counter()
     count = max(int(trials * problem.trials), 2)
@@ -145,6 +149,7 @@ def measure(problem: Problem, trials: int) -> Row:
         start = time.perf_counter()
         result = register_spots(spots.spots_px, frame, scanner.scale, options, previous=guess)
         times.append(time.perf_counter() - start)
+        units.append(yardstick.once())
         if not result:
             refused[result.reason] += 1
         elif not is_wrong(result.scanner_from_frame, spots.slice_from_frame):
@@ -154,7 +159,7 @@ def measure(problem: Problem, trials: int) -> Row:
         else:
             wrong += 1
     p99_s = float(np.percentile(times, 99))
-    return Row(problem, right, weak, wrong, dict(refused), float(np.median(times)), p99_s)
+    return Row(problem, right, weak, wrong, dict(refused), float(np.median(times)), p99_s, float(np.median(units)))
 
 
 def _drawn(

@@ -34,8 +34,8 @@ _MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
 _DEGENERATE_ROTATION_DEG = 10.0
 # Probabilities of a residual as large by the stated noise alone: less than these, and it is not the noise.
 _IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
-# Standard deviations beyond which a pose is accepted with a caution.
-_WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 1.0, 1.0
+# Standard deviations beyond which a pose is accepted with a caution: four of them are 2 mm and 3 degrees.
+_WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 0.5, 0.75
 
 
 def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:
@@ -172,7 +172,7 @@ def register_spots(
         )
     if best.position_std_mm > _WEAK_POSITION_MM or best.rotation_std_deg > _WEAK_ROTATION_DEG:
         cautions.append(
-            f"weakly determined: standard deviation {best.position_std_mm:.1f} mm, {best.rotation_std_deg:.1f} degrees"
+            f"weakly determined: standard deviation {best.position_std_mm:.2f} mm, {best.rotation_std_deg:.2f} degrees"
         )
     caution = "; ".join(cautions)
     return Registration(frame, scale, options, spots_px, best, caution)

@@ -243,6 +243,22 @@ class TestRefusals:
         assert result.reason == "inaccurate"
         assert "0.01 mm" in result.message
 
+    def test_what_may_be_two_millimetres_or_three_degrees_off_bears_a_caution(self):
+        """Four standard deviations are the measure; upright rods leave the tilt open at some poses, not at all."""
+        frame = load_frame("leksell_ct")
+        options = RegistrationOptions(max_rotation_deg=40.0, spot_noise_px=0.3)
+        rng = np.random.default_rng(5)
+        seen = set()
+        for _ in range(40):
+            problem = random_spot_set(rng, frame, SpotSetSettings(ScannerSettings(shape=(640, 640)), 6, 0, 0.5))
+            result = register_spots(problem.spots_px, frame, SCALE, options)
+            if result:
+                estimate = result.estimate
+                weak = 4 * estimate.position_std_mm > 2.0 or 4 * estimate.rotation_std_deg > 3.0
+                assert ("weakly determined" in result.caution) == weak
+                seen.add(weak)
+        assert seen == {True, False}
+
     def test_degenerate_names_the_direction(self):
         """At right angles to a Leksell box, the turn about the line across its plates is of second order."""
         frame = load_frame("leksell_ct")

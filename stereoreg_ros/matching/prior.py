@@ -51,10 +51,12 @@ class Prior:
 
     def turns(self, normals: Array) -> Array:
         """Room (p,), in rad, for a slice to turn about its normal, where that is one of these (p, 3) in the frame."""
+        if self.max_rotation >= np.pi:
+            return np.full(len(normals), 2 * np.pi)
         # Of all rotations to that normal the nearest one is a pure tilt; one that is turned on by psi is at an angle
         # whose half has the cosine cos(tilt / 2) cos(psi / 2).
         half_tilt = np.cos(np.arccos(np.clip(normals @ self.normal, -1.0, 1.0)) / 2)
-        ratio = np.cos(min(self.max_rotation, np.pi) / 2) / np.maximum(half_tilt, 1e-12)
+        ratio = np.cos(self.max_rotation / 2) / np.maximum(half_tilt, 1e-12)
         turns: Array = 4 * np.arccos(np.minimum(ratio, 1.0))
         return turns
 

@@ -114,6 +114,7 @@ class _Search:
         self._order = triple_order(frame, options.min_inliers)
         self._searched: dict[int, list[SeedSearch]] = {}
         self._searched_down_to: dict[int, int] = {}
+        self._log10_false_alarms: dict[Hypothesis, float] = {}
         self._work = 0.0
 
     @property
@@ -123,8 +124,13 @@ class _Search:
 
     def is_acceptable(self, hypothesis: Hypothesis) -> bool:
         """Whether chance is ruled out as an explanation of the explanation."""
-        value = log10_false_alarms(hypothesis, self._spots, self._frame, self._prior)
-        return value <= self._options.max_log10_false_alarms
+        return self._false_alarms(hypothesis) <= self._options.max_log10_false_alarms
+
+    def _false_alarms(self, hypothesis: Hypothesis) -> float:
+        if hypothesis not in self._log10_false_alarms:
+            value = log10_false_alarms(hypothesis, self._spots, self._frame, self._prior)
+            self._log10_false_alarms[hypothesis] = value
+        return self._log10_false_alarms[hypothesis]
 
     def hopeless(self, level: int) -> bool:
         """Whether even a true match of so many rods would hardly be told from chance."""
@@ -134,7 +140,7 @@ class _Search:
     def is_told_apart(self, level: int, best: Hypothesis, apart: float) -> bool:
         """Whether chance brings matches of so many rods so much more often that they are no rivals of the best."""
         least = least_log10_false_alarms(level, self._spots, self._frame, self._prior)
-        return least > log10_false_alarms(best, self._spots, self._frame, self._prior) + apart
+        return least > self._false_alarms(best) + apart
 
     def has_rivals(self, level: int, chi_square: float) -> bool:
         """Whether chance may bring explanations of `level` rods, of so low a chi-square, that could be accepted."""
