@@ -87,6 +87,7 @@ def register_spots(
     scanner_from_slice: Pose | None = None,
     slice_area_mm2: float | None = None,
     previous: Pose | None = None,
+    covariances_px2: ArrayLike | None = None,
 ) -> Registration | Refusal:
     """Register `frame` from the centres of bright spots (n, 2) in pixel (u, v), false ones among them.
 
@@ -94,8 +95,10 @@ def register_spots(
     area over which spots could have been found; by default it is judged by the spots themselves. previous: a guess,
     scanner_from_frame of the slice before; where the frame is still near it, little else has to be searched, and chance
     brings less. Half of the false alarms that are allowed are for poses near the guess, half for all poses, so that a
-    guess however wrong costs no certainty. The matcher `maurin2009` makes no use of it.
-    Raises ValueError where the spots are not of shape (n, 2) or not finite.
+    guess however wrong costs no certainty. The matcher `maurin2009` makes no use of it. covariances_px2: (n, 2, 2), of
+    the centres, in pixel^2, besides `spot_noise_px`, which is of what all spots have in common: how well the frame's
+    geometry is known, and the image's.
+    Raises ValueError where the spots are not of shape (n, 2) or not finite, or their covariances are none.
     """
     options = options or RegistrationOptions()
     scanner_from_slice = scanner_from_slice or Pose.identity()
@@ -106,6 +109,7 @@ def register_spots(
         raise ValueError(f"spots_px has shape {spots_px.shape}, expected (n, 2)")
     if not np.isfinite(spots_px).all():
         raise ValueError("spots_px must be finite")
+    covariances_px2 = _checked(covariances_px2, len(spots_px))
 
     def refuse(reason: Reason, message: str, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
         return Refusal(frame, scale, spots_px, reason, message, estimates)
@@ -116,7 +120,7 @@ def register_spots(
     if count > MAX_SPOTS:
         return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
 
-    spots = _prepare(spots_px, scale, options.spot_noise_px, slice_area_mm2)
+    spots = _in_mm(spots_px, covariances_px2, scale, options.spot_noise_px, slice_area_mm2)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
     found = None
@@ -182,15 +186,25 @@ def _area_mm2(ct_slice: Slice) -> float:
     return ct_slice.hu.size * ct_slice.scale.sx * ct_slice.scale.sy
 
 
-def _prepare(spots_px: Array, scale: PixelScale, noise_px: float, slice_area_mm2: float | None) -> Spots:
-    mm = scale.to_mm(spots_px)
-    return Spots(
-        mm=mm,
-        whitening=scale.inverse_matrix / noise_px,
-        sigma_mm=_noise_mm(scale, noise_px),
-        variance_mm2=noise_px**2 * scale.sx * scale.sy,
-        slice_area_mm2=slice_area_mm2,
-    )
+def _in_mm(
+    spots_px: Array, covariances_px2: Array, scale: PixelScale, noise_px: float, slice_area_mm2: float | None
+) -> Spots:
+    whole = covariances_px2 + noise_px**2 * np.eye(2)
+    return Spots.of(scale.to_mm(spots_px), scale.matrix @ whole @ scale.matrix.T, slice_area_mm2)
+
+
+def _checked(covariances_px2: ArrayLike | None, spots: int) -> Array:
+    """Covariances (spots, 2, 2); zero where there are none."""
+    if covariances_px2 is None:
+        return np.zeros((spots, 2, 2))
+    covariances = np.asarray(covariances_px2, dtype=np.float64)
+    if covariances.shape != (spots, 2, 2):
+        raise ValueError(f"covariances_px2 has shape {covariances.shape}, expected ({spots}, 2, 2)")
+    if not np.isfinite(covariances).all() or not np.array_equal(covariances, np.swapaxes(covariances, 1, 2)):
+        raise ValueError("covariances_px2 must be finite and symmetric")
+    if spots and np.linalg.eigvalsh(covariances).min() < 0:
+        raise ValueError("covariances_px2 holds a matrix with a negative variance")
+    return covariances
 
 
 def _noise_mm(scale: PixelScale, noise_px: float) -> float:

@@ -28,8 +28,8 @@ MOST_STARTS = 6000
 
 def spots_of(settings: SpotSetSettings, spots_px: np.ndarray) -> Spots:
     scale, noise_px = settings.scanner.scale, settings.noise_std_px
-    whitening = scale.inverse_matrix / noise_px
-    return Spots(scale.to_mm(spots_px), whitening, noise_px * scale.sx, noise_px**2 * scale.sx * scale.sy, None)
+    covariance = noise_px**2 * scale.matrix @ scale.matrix.T
+    return Spots.of(scale.to_mm(spots_px), np.tile(covariance, (len(spots_px), 1, 1)), None)
 
 
 def all_positions(rng: np.random.Generator, spots: Spots, frame: Frame, lines: tuple[int, ...]) -> list[Hypothesis]:
@@ -59,9 +59,9 @@ def all_positions(rng: np.random.Generator, spots: Spots, frame: Frame, lines: t
         starts += [(rotation, offset, matched) for rotation, offset in zip(rotations, translations, strict=True)]
     if len(starts) > MOST_STARTS:
         starts = [starts[row] for row in rng.choice(len(starts), MOST_STARTS, replace=False)]
-    parts = [np.array(part) for part in zip(*starts, strict=True)]
-    found = settle(spots, frame, Starts(*parts, np.arange(len(starts))), 4)
-    return distinct(found, spots.gain(frame))
+    rotations, translations, matches = (np.array(part) for part in zip(*starts, strict=True))
+    found = settle(spots, frame, Starts(rotations, translations, matches, np.arange(len(starts))), 4)
+    return distinct(found, spots.gains(frame))
 
 
 def is_same(a: Hypothesis, b: Hypothesis) -> bool:
@@ -83,7 +83,7 @@ def test_nothing_that_a_search_of_all_positions_finds_is_missed(name: str, visib
     for _ in range(PROBLEMS):
         problem = random_spot_set(rng, frame, settings)
         spots = spots_of(settings, problem.spots_px)
-        gain = spots.gain(frame)
+        gains = spots.gains(frame)
         ours = three_line.match(spots, frame, prior, options).hypotheses
         # Any three rods with a spot will do: a search of all positions along these finds every explanation with them.
         predicted, _ = project(frame, problem.slice_from_frame, SCANNER.scale)
@@ -94,7 +94,7 @@ def test_nothing_that_a_search_of_all_positions_finds_is_missed(name: str, visib
         compared += bool(others)
         if others:
             assert ours, "found nothing"
-            assert score(ours[0], gain) > score(others[0], gain) - 1e-6
+            assert score(ours[0], gains) > score(others[0], gains) - 1e-6
             # One that the best one does not rule out has to be listed with it.
             for other in judged(others, spots, frame, prior, 0.99):
                 rivals += 1

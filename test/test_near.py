@@ -139,7 +139,7 @@ def test_twins_of_what_is_known_are_sought_even_where_chance_is_not_ruled_out() 
     truth = random_pose(np.random.default_rng(9), frame, SCANNER, max_tilt_deg=4.0, max_offset_mm=10.0)
     spots_px, _ = project(frame, truth, SCALE)
     mm = SCALE.to_mm(spots_px)
-    spots = Spots(mm, SCALE.inverse_matrix / 0.3, 0.15, 0.15**2, 256.0**2)
+    spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2)
     prior = Prior(np.eye(3), np.pi)
     every = three_line.match(spots, frame, prior, RegistrationOptions()).hypotheses
     assert len(every) == 2

@@ -139,10 +139,10 @@ class TestPoseVolume:
         jacobian = cut_jacobian(cuts, np.array([0.0, 0.0, 60.0])).reshape(-1, 6)
         square = jacobian.T @ jacobian
         assert np.linalg.det(square) < 1e-3
-        assert stretch(square, 0.02) > 1e3
+        assert stretch(square / 0.02, 0.02) > 1e3
         assert low_stretch(frame, 6, 0.02) > 0
         regular = np.diag([6.0, 6, 2, 5e3, 5e3, 5e3])
-        assert stretch(regular, 0.02) == pytest.approx(math.sqrt(np.linalg.det(regular)), rel=0.01)
+        assert stretch(regular / 0.02, 0.02) == pytest.approx(math.sqrt(np.linalg.det(regular)), rel=0.01)
 
     def test_is_drawn_once(self) -> None:
         frame = load_frame("zframe")

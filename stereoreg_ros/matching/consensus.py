@@ -43,29 +43,38 @@ MISSING_COST = 3.0
 class Spots(NamedTuple):
     """Spots as the matcher sees them.
 
-    mm: (s, 2) in the slice; whitening: (2, 2) 1/mm, to unit variance; sigma_mm: the larger standard deviation of a
-    spot's centre along x or y; variance_mm2: product of both; slice_area_mm2: over which spots could lie, None where
-    not known.
+    mm: (s, 2) in the slice; covariances_mm2: (s, 2, 2), of the centres; slice_area_mm2: over which spots could lie,
+    None where not known. whitening: (s, 2, 2) 1/mm, turns a residual in mm into one of unit variance; variances_mm2:
+    (s,), product of the standard deviations along the two axes of each; sigma_mm: the largest of all.
     """
 
     mm: Array
-    whitening: Array
-    sigma_mm: float
-    variance_mm2: float
+    covariances_mm2: Array
     slice_area_mm2: float | None
+    whitening: Array
+    variances_mm2: Array
+    sigma_mm: float
 
-    def gain(self, frame: Frame) -> float:
-        """Log-likelihood ratio of a spot right where a rod is predicted, to its being one of the clutter.
+    @classmethod
+    def of(cls, mm: Array, covariances_mm2: Array, slice_area_mm2: float | None) -> Spots:
+        """Spots (s, 2) mm with the covariances (s, 2, 2) mm^2 of their centres."""
+        whitening = np.linalg.inv(np.linalg.cholesky(covariances_mm2))
+        variances = np.sqrt(np.linalg.det(covariances_mm2))
+        largest = float(np.linalg.eigvalsh(covariances_mm2).max()) if len(mm) else 0.0
+        return cls(mm, covariances_mm2, slice_area_mm2, whitening, variances, math.sqrt(largest))
+
+    def gains(self, frame: Frame) -> Array:
+        """Log-likelihood ratios (s,) of each spot right where a rod is predicted, to its being one of the clutter.
 
         The clutter is taken to be as dense as if every rod had a spot.
         """
         clutter = max(len(self.mm) - len(frame), 0) + 1
         area_mm2 = area_of_uniform_mm2(self.mm, self.slice_area_mm2)
-        return math.log(area_mm2 / (clutter * 2 * math.pi * self.variance_mm2))
+        return np.asarray(np.log(area_mm2 / (clutter * 2 * math.pi * self.variances_mm2)))
 
     def only(self, rows: NDArray[np.intp]) -> Spots:
         """Some of the spots."""
-        return self._replace(mm=self.mm[rows])
+        return Spots.of(self.mm[rows], self.covariances_mm2[rows], self.slice_area_mm2)
 
     def surround(self, points_mm: Array) -> NDArray[np.bool_]:
         """Which points (..., 2) mm lie within the box around the spots: there a rod would have been seen."""
@@ -81,18 +90,22 @@ def count_missing(spots: Spots, frame: Frame, cuts: Cuts, spot_of_line: NDArray[
     return np.asarray((sure & (spot_of_line == UNMATCHED)).sum(axis=1))
 
 
-def score(hypothesis: Hypothesis, gain: float) -> float:
-    """Log-likelihood of an explanation over all spots being clutter: what explanations are ranked by."""
-    return hypothesis.inliers * gain - hypothesis.chi_square / 2 - MISSING_COST * hypothesis.missing
+def score(hypothesis: Hypothesis, gains: Array) -> float:
+    """Log-likelihood of an explanation over all spots being clutter: what explanations are ranked by.
+
+    gains: see `Spots.gains`.
+    """
+    matched = hypothesis.spot_of_line[hypothesis.spot_of_line != UNMATCHED]
+    return float(gains[matched].sum()) - hypothesis.chi_square / 2 - MISSING_COST * hypothesis.missing
 
 
-def distinct(found: list[Hypothesis], gain: float) -> list[Hypothesis]:
-    """The explanations best first, without those that say the same as a better one.
+def distinct(found: list[Hypothesis], gains: Array) -> list[Hypothesis]:
+    """The explanations best first, without those that say the same as a better one; gains: see `Spots.gains`.
 
     Two optima of one flat valley are one explanation, whose covariance holds both: near a double root the tilt's sign
     is not known, and the better optimum's own curvature does not say so.
     """
-    scores = {id(hypothesis): score(hypothesis, gain) for hypothesis in found}
+    scores = {id(hypothesis): score(hypothesis, gains) for hypothesis in found}
     found = sorted(found, key=lambda h: -scores[id(h)])
     kept: list[Hypothesis] = []
     for hypothesis in found:
@@ -101,7 +114,7 @@ def distinct(found: list[Hypothesis], gain: float) -> list[Hypothesis]:
         for row, other in enumerate(kept):
             difference = _difference(hypothesis, other)
             if _is_same(difference, hypothesis, other):
-                kept[row] = _widened(other, difference, score(other, gain) - score(hypothesis, gain))
+                kept[row] = _widened(other, difference, score(other, gains) - score(hypothesis, gains))
                 break
         else:
             kept.append(hypothesis)
@@ -152,11 +165,11 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
     """
     if not found:
         return []
-    gain = spots.gain(frame)
+    gains = spots.gains(frame)
     rivals = [
         replace(one, log10_false_alarms=log10_false_alarms(one, spots, frame, prior))
         for one in found
-        if score(found[0], gain) - score(one, gain) < apart * math.log(10)
+        if score(found[0], gains) - score(one, gains) < apart * math.log(10)
     ]
     return [one for one in rivals if one.log10_false_alarms <= rivals[0].log10_false_alarms + apart]
 
@@ -164,29 +177,43 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
 def log10_false_alarms(hypothesis: Hypothesis, spots: Spots, frame: Frame, prior: Prior) -> float:
     """log10 of how many explanations as good as this one chance brings, over its share of those that are allowed."""
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
+    matched = hypothesis.spot_of_line[lines]
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
-    jacobian = cut_jacobian(cuts, hypothesis.translation)[lines].reshape(-1, 6)
-    ratio = float(stretch(jacobian.T @ jacobian, spots.variance_mm2))
-    area_mm2 = clutter_area_mm2(spots.mm, hypothesis.spot_of_line[lines], spots.slice_area_mm2)
+    jacobian = (spots.whitening[matched] @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
+    variance_mm2 = _typical(spots.variances_mm2[matched])
+    ratio = float(stretch(jacobian.T @ jacobian, variance_mm2))
+    area_mm2 = clutter_area_mm2(spots.mm, matched, spots.slice_area_mm2)
     volume = pose_volume(frame, len(lines), prior, area_mm2)
-    chance = Chance(len(spots.mm), area_mm2, spots.variance_mm2, ratio * volume)
+    chance = Chance(len(spots.mm), area_mm2, variance_mm2, ratio * volume)
     return log10_expected(len(lines), hypothesis.chi_square, chance) - math.log10(share_of(len(lines), len(frame)))
 
 
 def least_log10_false_alarms(inliers: int, spots: Spots, frame: Frame, prior: Prior) -> float:
     """What `log10_false_alarms` of a true explanation of so many rods is hardly ever below."""
-    ratio = low_stretch(frame, inliers, spots.variance_mm2)
-    value = log10_expected(inliers, lucky_chi_square(inliers), _chance(inliers, ratio, spots, frame, prior))
-    return value - math.log10(share_of(inliers, len(frame)))
+    variance_mm2 = _in_steps(_typical(np.sort(spots.variances_mm2)[:inliers]))
+    ratio = low_stretch(frame, inliers, variance_mm2)
+    chance = _chance(inliers, ratio, variance_mm2, spots, frame, prior)
+    return log10_expected(inliers, lucky_chi_square(inliers), chance) - math.log10(share_of(inliers, len(frame)))
 
 
 def log10_by_chance(inliers: int, chi_square: float, spots: Spots, frame: Frame, prior: Prior) -> float:
     """log10 of how many explanations of so many rods, with a chi-square this low, chance brings within the prior."""
     ratio = plane_sample(frame, inliers).mean_ratio
-    return log10_expected(inliers, chi_square, _chance(inliers, ratio, spots, frame, prior))
+    variance_mm2 = _typical(np.sort(spots.variances_mm2)[-inliers:])
+    return log10_expected(inliers, chi_square, _chance(inliers, ratio, variance_mm2, spots, frame, prior))
 
 
-def _chance(inliers: int, ratio: float, spots: Spots, frame: Frame, prior: Prior) -> Chance:
+def _typical(variances_mm2: Array) -> float:
+    """The one variance that spots could all have instead of these, for chance to bring as many explanations."""
+    return math.exp(float(np.log(variances_mm2).mean()))
+
+
+def _in_steps(variance_mm2: float) -> float:
+    """A variance rounded down in steps of one in fifty, so that few are looked up."""
+    return float(1.02 ** math.floor(math.log(variance_mm2) / math.log(1.02) + 1e-6))
+
+
+def _chance(inliers: int, ratio: float, variance_mm2: float, spots: Spots, frame: Frame, prior: Prior) -> Chance:
     area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
     volume = pose_volume(frame, inliers, prior, area_mm2)
-    return Chance(len(spots.mm), area_mm2, spots.variance_mm2, ratio * volume)
+    return Chance(len(spots.mm), area_mm2, variance_mm2, ratio * volume)

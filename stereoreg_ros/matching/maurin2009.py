@@ -123,7 +123,7 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
         np.array([start.translation for start, _ in starts]),
         spots.mm[spot_of_line],
         spot_of_line != UNMATCHED,
-        spots.whitening,
+        spots.whitening[spot_of_line],
     )
     kept = refined.converged & (prior.angles(refined.rotations) <= prior.max_rotation)
     missing = count_missing(spots, frame, refined.cuts, spot_of_line)
@@ -138,7 +138,7 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
         )
         for i in np.flatnonzero(kept)
     ]
-    found = distinct(found, spots.gain(frame))
+    found = distinct(found, spots.gains(frame))
     return Found(judged(found, spots, frame, prior, decades_apart(options)), SAMPLE + 1)
 
 

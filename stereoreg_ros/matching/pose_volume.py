@@ -115,13 +115,13 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
     return PlaneSample(normals[chosen], sets, widths, boxes, weight, mean_ratio, np.concatenate(squares))
 
 
-def stretch(squares: Array, variance_mm2: float) -> Array:
-    """sqrt det J'J (...) of J'J (..., 6, 6), for spots of that variance, mm^2.
+def stretch(information: Array, variance_mm2: float) -> Array:
+    """sqrt det J'J (...) in mm^6, for spots of that variance, mm^2; information: (..., 6, 6), J'J over the variance.
 
     Spots do not leave a direction of the pose wholly open: where they do so to first order, the second bounds it.
     """
     openness = np.diag([_OPEN_POSITION_MM**-2] * 3 + [_OPEN_ROTATION**-2] * 3)
-    determinant = np.linalg.det(squares / variance_mm2 + openness)
+    determinant = np.linalg.det(information + openness)
     ratio: Array = np.sqrt(np.maximum(determinant, 0.0)) * variance_mm2**3
     return ratio
 
@@ -129,7 +129,7 @@ def stretch(squares: Array, variance_mm2: float) -> Array:
 @lru_cache(maxsize=256)
 def low_stretch(frame: Frame, rods: int, variance_mm2: float) -> float:
     """What few poses' stretch is below."""
-    ratios = stretch(plane_sample(frame, rods).squares, variance_mm2)
+    ratios = stretch(plane_sample(frame, rods).squares / variance_mm2, variance_mm2)
     return float(np.percentile(ratios, _LOW)) if ratios.size else 0.0
 
 

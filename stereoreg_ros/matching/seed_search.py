@@ -23,6 +23,8 @@ _LEAST_FLATNESS = 0.03
 _LEAST_DISTANCE_MM = 1e-3
 # What the first order may leave out of a squared distance.
 _FIRST_ORDER_SLACK = 10.0
+# A prediction of a larger variance, mm^2, is none: a rod that runs within the slice.
+_VAGUE_MM2 = 1e12
 # A seed so near an explanation (mm, and the rotation matrix's elements) leads to it.
 _SAME_MM, _SAME_ROTATION = 5.0, 0.1
 # Triples of spots looked at in one piece: what belongs to it then stays in the processor's cache.
@@ -277,6 +279,7 @@ def _predict(
         on_rod = (lambdas >= low - slide) & (lambdas <= high + slide)
         slide += END_SLACK_MM + SURE_MM
         sure = (lambdas >= low + slide) & (lambdas <= high - slide) & upright
+        on_rod &= xx + yy < _VAGUE_MM2
     longest = np.maximum(ax**2 + ay**2, bx**2 + by**2)
     on_rod &= np.abs(ax * by - ay * bx) > _LEAST_FLATNESS * longest
     x = corner_x[0] + second * ax + third * bx

@@ -64,7 +64,7 @@ def _refine(
     spots: Spots, frame: Frame, rotations: Array, translations: Array, spot_of_line: NDArray[np.intp], steps: int
 ) -> Refined:
     used = spot_of_line != UNMATCHED
-    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, spots.whitening, steps)
+    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, spots.whitening[spot_of_line], steps)
 
 
 def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
@@ -72,16 +72,17 @@ def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
     regular = refined.information + 1e-9 * np.eye(6) * np.trace(refined.information, axis1=1, axis2=2)[:, None, None]
     covariance = np.linalg.inv(regular)
     with np.errstate(invalid="ignore", divide="ignore"):
-        jacobian = spots.whitening @ cut_jacobian(refined.cuts, refined.translations)
+        jacobian = cut_jacobian(refined.cuts, refined.translations)
         # Of a spot used for the pose the residual varies less than this, of another one just as much: a gate for both.
         predicted = jacobian @ covariance[:, None] @ np.swapaxes(jacobian, -1, -2)
-    xx, yy, xy = predicted[..., 0, 0] + 1, predicted[..., 1, 1] + 1, predicted[..., 0, 1]
-    with np.errstate(invalid="ignore", over="ignore"):
-        known = xx + yy < _VAGUE  # false for NaN too: a rod that runs within the slice
-        determinant = np.where(known, xx * yy - xy**2, 1.0)
-        offset = (spots.mm[None, None] - refined.cuts.points_mm[:, :, None]) @ spots.whitening.T
-        squared = yy[..., None] * offset[..., 0] ** 2 + xx[..., None] * offset[..., 1] ** 2
-        squared = (squared - 2 * xy[..., None] * offset[..., 0] * offset[..., 1]) / determinant[..., None]
+        known = predicted[..., 0, 0] + predicted[..., 1, 1] < _VAGUE * spots.sigma_mm**2  # false for NaN too
+    noise = spots.covariances_mm2
+    xx, yy, xy = (predicted[..., i, j, None] + noise[:, i, j] for i, j in ((0, 0), (1, 1), (0, 1)))
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        offset_x = spots.mm[:, 0] - refined.cuts.points_mm[..., 0, None]
+        offset_y = spots.mm[:, 1] - refined.cuts.points_mm[..., 1, None]
+        squared = yy * offset_x**2 + xx * offset_y**2 - 2 * xy * offset_x * offset_y
+        squared /= xx * yy - xy**2
     in_slack = refined.cuts.lambdas >= frame.lambda_min - END_SLACK_MM
     in_slack &= refined.cuts.lambdas <= frame.lambda_max + END_SLACK_MM
     in_slack &= np.abs(refined.cuts.directions[..., 2]) >= LEAST_COSINE

@@ -64,7 +64,7 @@ def match(
     explanation, as twins of a pose share them, and among all spots where chance may bring one that could be accepted.
     Complete but for the seeds: see docs/matching.md for how many of the poses a triple of rods finds.
     """
-    gain, apart = spots.gain(frame), decades_apart(options)
+    gains, apart = spots.gains(frame), decades_apart(options)
     search = _Search(spots, frame, prior, options)
     found = list(known)
     least_rods = len(frame) + 1
@@ -74,13 +74,13 @@ def match(
             if not known and (not found or not search.is_acceptable(found[0])):
                 if search.hopeless(level):
                     break
-                found = distinct([*found, *search.level(level, math.inf, found)], gain)
+                found = distinct([*found, *search.level(level, math.inf, found)], gains)
             else:
-                most_chi_square = 2 * (level * gain - score(found[0], gain) + apart * math.log(10))
+                most_chi_square = 2 * (level * gains.max() - score(found[0], gains) + apart * math.log(10))
                 if most_chi_square < 0 or search.is_told_apart(level, found[0], apart):
                     break
                 further = search.level if search.has_rivals(level, most_chi_square) else search.level_of_twins
-                found = distinct([*found, *further(level, most_chi_square, found)], gain)
+                found = distinct([*found, *further(level, most_chi_square, found)], gains)
             least_rods = level
     except _TooMuchWorkError:
         return Found([], least_rods, "given up: too many of them look like parts of the frame")
@@ -94,7 +94,7 @@ def match_most(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOp
         for level in search.levels:
             if search.hopeless(level):
                 break
-            found = distinct(list(search.level(level, math.inf, [])), spots.gain(frame))
+            found = distinct(list(search.level(level, math.inf, [])), spots.gains(frame))
             if found:
                 return judged(found, spots, frame, prior, decades_apart(options))
     except _TooMuchWorkError:

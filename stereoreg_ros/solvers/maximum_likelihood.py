@@ -64,8 +64,8 @@ def refine(
     """Refine m poses slice_from_frame by Levenberg-Marquardt on the residuals in the slice.
 
     rotations (m, 3, 3), translations (m, 3) mm: where to start. spots_mm (m, n, 2): the spot of each rod, in mm in the
-    slice, anything where used (m, n) is false. whitening (2, 2) 1/mm: turns a residual in mm into one of unit
-    variance, S^-1 / sigma for isotropic noise of sigma pixel.
+    slice, anything where used (m, n) is false. whitening, (m, n, 2, 2) or (2, 2) for all alike, 1/mm: turns a residual
+    in mm into one of unit variance, S^-1 / sigma for isotropic noise of sigma pixel.
     """
     m = len(rotations)
     target = np.where(used[..., None], spots_mm, 0.0)
@@ -73,6 +73,7 @@ def refine(
     # Where poses at rest are written to; the others go on among themselves.
     ended = _State(*(part.copy() for part in state))
     converged = np.zeros(m, dtype=bool)
+    whitening = np.broadcast_to(whitening, (m, len(frame), 2, 2))
     rows, damping = np.arange(m), np.full(m, _FIRST_DAMPING)
     for number in range(iterations if m else 0):
         damped = state.information.copy()
@@ -100,6 +101,7 @@ def refine(
                 break
             going = ~resting
             rows, damping, target, used = rows[going], damping[going], target[going], used[going]
+            whitening = whitening[going]
             state = _State(*(part[going] for part in state))
     cuts = cut(frame, ended.rotations, ended.translations)
     return Refined(ended.rotations, ended.translations, ended.chi_square, ended.information, converged, cuts)
@@ -170,7 +172,7 @@ def _evaluate(
     m, n = used.shape
     cuts = cut(frame, rotations, translations)
     mask = used[..., None]
-    residual = (np.where(mask, target - cuts.points_mm, 0.0) @ whitening.T).reshape(m, 2 * n, 1)
+    residual = (whitening @ np.where(mask, target - cuts.points_mm, 0.0)[..., None]).reshape(m, 2 * n, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian = whitening @ cut_jacobian(cuts, translations)
     flat = np.where(mask[..., None], jacobian, 0.0).reshape(m, 2 * n, 6)
