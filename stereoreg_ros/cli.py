@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -166,15 +166,26 @@ def _add_registration_options(group: argparse._ArgumentGroup) -> None:
         default: Any = entry.default
         several = isinstance(default, tuple)
         kind = type(default[0] if several else default)
+        word = entry.metadata["word"]
         shown = " ".join(f"{value:g}" for value in default) if several else default
         group.add_argument(
             f"--{entry.name.replace('_', '-')}",
             metavar="NAME" if kind is str else "N",
             nargs=len(default) if several else None,
-            type=kind,
+            type=kind if word is None else _number_or(word),
             default=default,
             help=f"{entry.metadata['description']} (default: {shown})".replace("%", "%%"),
         )
+
+
+def _number_or(word: str) -> Callable[[str], float | str]:
+    """What reads a number or the word."""
+
+    def read(text: str) -> float | str:
+        return word if text.strip() == word else float(text)
+
+    read.__name__ = "float"  # as argparse names it where it can be read as neither
+    return read
 
 
 def _register(arguments: argparse.Namespace) -> int:

@@ -9,11 +9,15 @@ import numpy as np
 
 from stereoreg_ros.geometry.pose import rotation_from_quaternion
 
+AUTO: Final = "auto"
 MATCHERS: Final = ("three_line", "maurin2009")
 
 
-def _option(default: Any, description: str, low: float | None = None, high: float | None = None) -> Any:
-    return field(default=default, metadata={"description": description, "low": low, "high": high})
+def _option(
+    default: Any, description: str, low: float | None = None, high: float | None = None, word: str | None = None
+) -> Any:
+    """A field with what users are told of it; word: what it may be instead of a number."""
+    return field(default=default, metadata={"description": description, "low": low, "high": high, "word": word})
 
 
 @dataclass(frozen=True)
@@ -23,10 +27,24 @@ class RegistrationOptions:
     Raises ValueError, naming the field, what was found and what was expected.
     """
 
-    threshold: float = _option(2000.0, "HU above which a pixel may belong to a rod's spot", -32768.0, 65535.0)
+    threshold: float | str = _option(
+        2000.0,
+        "HU above which a pixel may belong to a rod's spot; 'auto': spots are told by contrast to their surroundings",
+        -32768.0,
+        65535.0,
+        AUTO,
+    )
     min_spot_area_mm2: float = _option(0.5, "smallest area of a spot, mm^2", 0.0, 1000.0)
     max_spot_area_mm2: float = _option(80.0, "largest area of a spot, mm^2", 0.01, 10000.0)
-    spot_noise_px: float = _option(0.3, "standard deviation per axis of a spot's centre, pixel", 0.001, 10.0)
+    spot_noise_px: float = _option(
+        0.3,
+        "standard deviation per axis of a spot's centre, pixel; of one that shows to be worse, more",
+        0.001,
+        10.0,
+    )
+    slice_thickness_mm: float = _option(
+        0.0, "thickness of the slice, mm: a leaning rod's spot is as long as it has to be; 0: not known", 0.0, 50.0
+    )
     min_inliers: int = _option(4, "fewest rods that must have a spot", 4, 1000)
     matcher: str = _option("three_line", f"how spots are matched to rods: {' | '.join(MATCHERS)}")
     max_log10_false_alarms: float = _option(
@@ -46,11 +64,13 @@ class RegistrationOptions:
         for entry in fields(self):
             low, high = entry.metadata["low"], entry.metadata["high"]
             value = getattr(self, entry.name)
-            if low is None:
+            word = entry.metadata["word"]
+            if low is None or (word is not None and value == word):
                 continue
             number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
             if not number or not low <= value <= high:
-                raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}")
+                or_word = f", or '{word}'" if word else ""
+                raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}{or_word}")
         if int(self.min_inliers) != self.min_inliers:
             raise ValueError(f"min_inliers is {self.min_inliers!r}, expected a whole number")
         if self.matcher not in MATCHERS:

@@ -19,13 +19,13 @@ from stereoreg_ros.geometry.pose import Array, Pose, rotation_from_quaternion
 from stereoreg_ros.geometry.projection import point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.matching import maurin2009, three_line
-from stereoreg_ros.matching.consensus import Spots
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.near import match_near
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.spots import Spots, Streaks
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
-from stereoreg_ros.spots import find_spots
+from stereoreg_ros.spots import FoundSpots, find_spots
 from stereoreg_ros.uncertainty import in_scanner_axes
 
 MAX_SPOTS = 300
@@ -53,9 +53,8 @@ def register_slice(
     previous: see `register_spots`.
     """
     options = options or RegistrationOptions()
-    spots_px = find_spots(ct_slice, options)
-    area_mm2 = _area_mm2(ct_slice)
-    return register_spots(spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice, area_mm2, previous)
+    found = find_spots(ct_slice, options)
+    return _register_found(found, ct_slice, frame, options, previous)
 
 
 def register_frames(
@@ -67,16 +66,33 @@ def register_frames(
     one's spots are false spots. `Match.spot` counts in the spots of that frame's own result.
     """
     options = options or RegistrationOptions()
-    spots_px = find_spots(ct_slice, options)
+    found = find_spots(ct_slice, options)
     results: list[Registration | Refusal] = []
     for frame in frames:
-        result = register_spots(
-            spots_px, frame, ct_slice.scale, options, ct_slice.scanner_from_slice, _area_mm2(ct_slice)
-        )
+        result = _register_found(found, ct_slice, frame, options)
         if result:
-            spots_px = np.delete(spots_px, [match.spot for match in result.matches], axis=0)
+            found = found.take(np.delete(np.arange(len(found)), [match.spot for match in result.matches]))
         results.append(result)
     return results
+
+
+def _register_found(
+    found: FoundSpots, ct_slice: Slice, frame: Frame, options: RegistrationOptions, previous: Pose | None = None
+) -> Registration | Refusal:
+    scale = ct_slice.scale
+    area_mm2 = ct_slice.hu.size * scale.sx * scale.sy
+    streaks = _streaks(found, scale, options.slice_thickness_mm) if options.slice_thickness_mm > 0 else None
+    return _register(
+        found.centres_px,
+        found.covariances_px2,
+        streaks,
+        frame,
+        scale,
+        options,
+        ct_slice.scanner_from_slice,
+        area_mm2,
+        previous,
+    )
 
 
 def register_spots(
@@ -96,8 +112,8 @@ def register_spots(
     scanner_from_frame of the slice before; where the frame is still near it, little else has to be searched, and chance
     brings less. Half of the false alarms that are allowed are for poses near the guess, half for all poses, so that a
     guess however wrong costs no certainty. The matcher `maurin2009` makes no use of it. covariances_px2: (n, 2, 2), of
-    the centres, in pixel^2, besides `spot_noise_px`, which is of what all spots have in common: how well the frame's
-    geometry is known, and the image's.
+    the centres, pixel^2, as their image shows them; where they are smaller than `spot_noise_px` has it, that counts, as
+    the frame is known no better.
     Raises ValueError where the spots are not of shape (n, 2) or not finite, or their covariances are none.
     """
     options = options or RegistrationOptions()
@@ -110,6 +126,23 @@ def register_spots(
     if not np.isfinite(spots_px).all():
         raise ValueError("spots_px must be finite")
     covariances_px2 = _checked(covariances_px2, len(spots_px))
+    return _register(
+        spots_px, covariances_px2, None, frame, scale, options, scanner_from_slice, slice_area_mm2, previous
+    )
+
+
+def _register(
+    spots_px: Array,
+    covariances_px2: Array,
+    streaks: Streaks | None,
+    frame: Frame,
+    scale: PixelScale,
+    options: RegistrationOptions,
+    scanner_from_slice: Pose,
+    slice_area_mm2: float | None,
+    previous: Pose | None,
+) -> Registration | Refusal:
+    """Match, judge, accept or refuse; see `register_spots`."""
 
     def refuse(reason: Reason, message: str, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
         return Refusal(frame, scale, spots_px, reason, message, estimates)
@@ -120,7 +153,8 @@ def register_spots(
     if count > MAX_SPOTS:
         return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
 
-    spots = _in_mm(spots_px, covariances_px2, scale, options.spot_noise_px, slice_area_mm2)
+    covariances_mm2 = scale.matrix @ _at_least(covariances_px2, options.spot_noise_px) @ scale.matrix.T
+    spots = Spots.of(scale.to_mm(spots_px), covariances_mm2, slice_area_mm2, streaks)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
     found = None
@@ -182,15 +216,12 @@ def register_spots(
     return Registration(frame, scale, options, spots_px, best, caution)
 
 
-def _area_mm2(ct_slice: Slice) -> float:
-    return ct_slice.hu.size * ct_slice.scale.sx * ct_slice.scale.sy
-
-
-def _in_mm(
-    spots_px: Array, covariances_px2: Array, scale: PixelScale, noise_px: float, slice_area_mm2: float | None
-) -> Spots:
-    whole = covariances_px2 + noise_px**2 * np.eye(2)
-    return Spots.of(scale.to_mm(spots_px), scale.matrix @ whole @ scale.matrix.T, slice_area_mm2)
+def _streaks(found: FoundSpots, scale: PixelScale, thickness_mm: float) -> Streaks:
+    """How long the spots are: a uniform streak has a twelfth of its squared length as second moment."""
+    moments_mm2 = scale.matrix @ found.extents_px2 @ scale.matrix.T
+    values, vectors = np.linalg.eigh(moments_mm2)
+    length_mm = np.sqrt(12 * np.maximum(values[:, 1] - values[:, 0], 0.0))
+    return Streaks(length_mm[:, None] * vectors[:, :, 1], found.cut_short, thickness_mm)
 
 
 def _checked(covariances_px2: ArrayLike | None, spots: int) -> Array:
@@ -205,6 +236,15 @@ def _checked(covariances_px2: ArrayLike | None, spots: int) -> Array:
     if spots and np.linalg.eigvalsh(covariances).min() < 0:
         raise ValueError("covariances_px2 holds a matrix with a negative variance")
     return covariances
+
+
+def _at_least(covariances_px2: Array, noise_px: float) -> Array:
+    """Covariances (n, 2, 2) without a direction of a smaller standard deviation than noise_px."""
+    if not covariances_px2.any():
+        return np.tile(noise_px**2 * np.eye(2), (len(covariances_px2), 1, 1))
+    values, vectors = np.linalg.eigh(covariances_px2)
+    raised: Array = (vectors * np.maximum(values, noise_px**2)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return raised
 
 
 def _noise_mm(scale: PixelScale, noise_px: float) -> float:

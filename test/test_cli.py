@@ -182,6 +182,7 @@ def test_every_option_has_its_flag(stereoreg, cube_slice, monkeypatch):
         min_spot_area_mm2=1.0,
         max_spot_area_mm2=9.5,
         spot_noise_px=0.25,
+        slice_thickness_mm=2.5,
         min_inliers=5,
         max_log10_false_alarms=-1e-3,
         nominal_orientation=(-1e-3, 0.0, -1.0, 0.5),
@@ -195,7 +196,8 @@ def test_every_option_has_its_flag(stereoreg, cube_slice, monkeypatch):
     arguments = ["register", "--frame", "cube6", cube_slice]
     assert stereoreg(*arguments, *flags)[0] == 0
     assert stereoreg(*arguments)[0] == 0
-    assert given == [wanted, RegistrationOptions()]
+    assert stereoreg(*arguments, "--threshold", "auto")[0] == 0
+    assert given == [wanted, RegistrationOptions(), RegistrationOptions(threshold="auto")]
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,12 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import nearest_rotation, rotation_angle
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.matching import three_line
-from stereoreg_ros.matching.consensus import Spots, distinct, judged, score
+from stereoreg_ros.matching.consensus import distinct, judged, score
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import Starts
 from stereoreg_ros.matching.settling import settle
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_spot_set
 
 SCANNER = ScannerSettings(shape=(640, 640))

@@ -9,8 +9,8 @@ from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.matching import three_line
-from stereoreg_ros.matching.consensus import Spots
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_pose, random_spot_set
 
 SCANNER = ScannerSettings()

@@ -47,6 +47,14 @@ def test_numbers_of_numpy_are_numbers() -> None:
     assert RegistrationOptions(threshold=np.float32(300), min_inliers=np.int64(5)).min_inliers == 5  # type: ignore[arg-type]
 
 
+def test_threshold_may_be_automatic() -> None:
+    assert RegistrationOptions(threshold="auto").threshold == "auto"
+    with pytest.raises(ValueError, match="threshold is 'Auto', expected a number from -32768 to 65535, or 'auto'"):
+        RegistrationOptions(threshold="Auto")
+    with pytest.raises(ValueError, match=r"spot_noise_px is 'auto', expected a number from 0\.001 to 10$"):
+        RegistrationOptions(spot_noise_px="auto")  # type: ignore[arg-type]
+
+
 def test_min_inliers_is_whole() -> None:
     with pytest.raises(ValueError, match=r"min_inliers is 4\.5, expected a whole number"):
         RegistrationOptions(min_inliers=4.5)  # type: ignore[arg-type]

@@ -46,7 +46,7 @@ def test_shipped_wires_are_those_of_the_training_slices(scan, frame):
     assert len(training) == len(TRAINING_MM)
     points = []
     for ct_slice in training:
-        mm = ct_slice.scale.to_mm(find_spots(ct_slice, CATPHAN_OPTIONS))
+        mm = ct_slice.scale.to_mm(find_spots(ct_slice, CATPHAN_OPTIONS).centres_px)
         points.append(ct_slice.scanner_from_slice @ np.column_stack([mm, np.zeros(len(mm))]) - ORIGIN_MM)
     for name, (x, y, far_x, far_y) in PLACES.items():
         near = [p[(np.abs(p[:, 0] - x) < far_x) & (np.abs(p[:, 1] - y) < far_y)] for p in points]

@@ -300,6 +300,9 @@ def test_image_that_is_not_finite_is_refused(bench, value):
         ({"pixel_spacing": 0.5}, "Wrong parameter type"),
         ({"threshold": 1e9}, "threshold out of range"),
         ({"threshold": math.nan}, "threshold out of range"),
+        ({"threshold": "loud"}, "threshold is 'loud', expected a number from -32768 to 65535, or 'auto'"),
+        ({"threshold": [1.0]}, "threshold is (1.0,), expected a number"),
+        ({"threshold": True}, "threshold is True, expected a number"),
         ({"rescale_slope": 0.0}, "rescale_slope is 0.0, expected a number that is not 0"),
         ({"matcher": "guess"}, "matcher is 'guess', expected one of"),
         ({"nominal_orientation": [0.0, 0.0, 0.0, 0.0]}, "nominal_orientation"),
@@ -569,7 +572,8 @@ def test_start_values_that_cannot_be_end_the_node_with_a_sentence(tmp_path):
     file.write_text("register_node: [")
     faults = {
         ("-p", "threshold:=1e9"): "threshold out of range",
-        ("-p", "threshold:=2000"): "expecting type 'DOUBLE'",
+        ("-p", "threshold:=loud"): "threshold is 'loud', expected a number from -32768 to 65535, or 'auto'",
+        ("-p", "spot_noise_px:=1"): "expecting type 'DOUBLE'",
         ("-p", "pixel_spacing:=[-1.0, 1.0]"): "pixel_spacing is [-1.0, 1.0], expected two positive numbers",
         ("-p", "matcher:=guess"): "matcher is 'guess', expected one of",
         ("--params-file", str(file)): "Couldn't parse params file",

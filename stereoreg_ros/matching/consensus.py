@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from stereoreg_ros.matching.significance import (
     lucky_chi_square,
     share_of,
 )
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.visibility import LEAST_COSINE, SURE_MM
 from stereoreg_ros.options import RegistrationOptions
 
@@ -38,48 +38,6 @@ _FAR_BEHIND = 30.0
 _LEAST_DECADES_APART = 1.0
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
 MISSING_COST = 3.0
-
-
-class Spots(NamedTuple):
-    """Spots as the matcher sees them.
-
-    mm: (s, 2) in the slice; covariances_mm2: (s, 2, 2), of the centres; slice_area_mm2: over which spots could lie,
-    None where not known. whitening: (s, 2, 2) 1/mm, turns a residual in mm into one of unit variance; variances_mm2:
-    (s,), product of the standard deviations along the two axes of each; sigma_mm: the largest of all.
-    """
-
-    mm: Array
-    covariances_mm2: Array
-    slice_area_mm2: float | None
-    whitening: Array
-    variances_mm2: Array
-    sigma_mm: float
-
-    @classmethod
-    def of(cls, mm: Array, covariances_mm2: Array, slice_area_mm2: float | None) -> Spots:
-        """Spots (s, 2) mm with the covariances (s, 2, 2) mm^2 of their centres."""
-        whitening = np.linalg.inv(np.linalg.cholesky(covariances_mm2))
-        variances = np.sqrt(np.linalg.det(covariances_mm2))
-        largest = float(np.linalg.eigvalsh(covariances_mm2).max()) if len(mm) else 0.0
-        return cls(mm, covariances_mm2, slice_area_mm2, whitening, variances, math.sqrt(largest))
-
-    def gains(self, frame: Frame) -> Array:
-        """Log-likelihood ratios (s,) of each spot right where a rod is predicted, to its being one of the clutter.
-
-        The clutter is taken to be as dense as if every rod had a spot.
-        """
-        clutter = max(len(self.mm) - len(frame), 0) + 1
-        area_mm2 = area_of_uniform_mm2(self.mm, self.slice_area_mm2)
-        return np.asarray(np.log(area_mm2 / (clutter * 2 * math.pi * self.variances_mm2)))
-
-    def only(self, rows: NDArray[np.intp]) -> Spots:
-        """Some of the spots."""
-        return Spots.of(self.mm[rows], self.covariances_mm2[rows], self.slice_area_mm2)
-
-    def surround(self, points_mm: Array) -> NDArray[np.bool_]:
-        """Which points (..., 2) mm lie within the box around the spots: there a rod would have been seen."""
-        inside = (points_mm >= self.mm.min(axis=0)) & (points_mm <= self.mm.max(axis=0))
-        return np.asarray(inside.all(axis=-1))
 
 
 def count_missing(spots: Spots, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> NDArray[np.intp]:

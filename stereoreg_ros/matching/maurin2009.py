@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.matching.consensus import Spots, count_missing, decades_apart, distinct, judged
+from stereoreg_ros.matching.consensus import count_missing, decades_apart, distinct, judged
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION, POSE_RANK, assemble, condition_number
 from stereoreg_ros.solvers.ls_tz import solve_system

@@ -10,11 +10,12 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching import three_line
-from stereoreg_ros.matching.consensus import Spots, decades_apart, judged
+from stereoreg_ros.matching.consensus import decades_apart, judged
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Near, Prior
 from stereoreg_ros.matching.seed_search import Starts
 from stereoreg_ros.matching.settling import settle
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.options import RegistrationOptions
 
 # How far a spot may lie from where the known pose has its rod cut the slice, and the frame may have turned. What moved

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.matching.consensus import GATE, MISSING_COST, Spots
+from stereoreg_ros.matching.consensus import GATE, MISSING_COST
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE, SURE_MM
 from stereoreg_ros.solvers.three_lines import PAIRS, Seeds, ThreeLineSolver
 

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut_jacobian
-from stereoreg_ros.matching.consensus import GATE, Spots, count_missing
+from stereoreg_ros.matching.consensus import GATE, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
@@ -86,7 +87,10 @@ def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
     in_slack = refined.cuts.lambdas >= frame.lambda_min - END_SLACK_MM
     in_slack &= refined.cuts.lambdas <= frame.lambda_max + END_SLACK_MM
     in_slack &= np.abs(refined.cuts.directions[..., 2]) >= LEAST_COSINE
-    squared = np.where((in_slack & known)[..., None], squared, np.inf)
+    possible = (in_slack & known)[..., None]
+    if spots.streaks is not None:
+        possible = possible & spots.streaks.allow(refined.cuts)
+    squared = np.where(possible, squared, np.inf)
     nearest = squared.argmin(axis=2)
     least = np.take_along_axis(squared, nearest[..., None], axis=2)[..., 0]
     assigned = np.where(least <= GATE, nearest, UNMATCHED)

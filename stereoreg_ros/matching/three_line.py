@@ -16,7 +16,6 @@ import numpy as np
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.matching.consensus import (
-    Spots,
     decades_apart,
     distinct,
     judged,
@@ -30,6 +29,7 @@ from stereoreg_ros.matching.pose_volume import plane_sample
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, search_seeds
 from stereoreg_ros.matching.settling import settle
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.triple_order import triple_order
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.options import RegistrationOptions

@@ -24,13 +24,14 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One parameter: its name, default, what it means, and the range of a number (None: no range)."""
+    """One parameter: its name, default, what it means, a range (None: none), and a word in a number's place."""
 
     name: str
     default: Any
     description: str
     low: float | None = None
     high: float | None = None
+    word: str | None = None
 
     @property
     def value(self) -> Any:
@@ -41,6 +42,9 @@ class Entry:
     def descriptor(self) -> ParameterDescriptor:
         """The description that `ros2 param describe` shows."""
         descriptor = ParameterDescriptor(description=self.description)
+        if self.word is not None:
+            descriptor.dynamic_typing = True
+            descriptor.additional_constraints = f"a number, or '{self.word}'"
         if isinstance(self.default, tuple):
             descriptor.additional_constraints = f"{len(self.default)} numbers"
         elif self.low is not None and self.high is not None:
@@ -61,7 +65,14 @@ def setting(default: Any, description: str, low: float | None = None, high: floa
 def entries_of(settings: type) -> tuple[Entry, ...]:
     """The parameters of a dataclass whose fields were made by `setting`; fields without a default are left out."""
     return tuple(
-        Entry(entry.name, entry.default, entry.metadata["description"], entry.metadata["low"], entry.metadata["high"])
+        Entry(
+            entry.name,
+            entry.default,
+            entry.metadata["description"],
+            entry.metadata["low"],
+            entry.metadata["high"],
+            entry.metadata.get("word"),
+        )
         for entry in fields(settings)
         if entry.default is not MISSING
     )
