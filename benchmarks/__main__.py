@@ -1,4 +1,4 @@
-"""`make bench`: times as multiples of the yardstick Y, and how often the answer is right."""
+"""`make bench`: times as multiples of the yardstick Y, how good the spots are, and how often the answer is right."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import json
 import platform
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
 
@@ -14,9 +14,11 @@ import cv2
 import numpy as np
 import scipy
 
+from benchmarks import artefacts, spots
 from benchmarks.matching import BASELINE_FALSE_SPOTS, PROBLEMS, measure, measure_baseline
 from benchmarks.yardstick import Yardstick, seconds_of
-from stereoreg_ros import RegistrationOptions, load_frame
+from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
+from stereoreg_ros.options import AUTO
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 from stereoreg_ros.spots import find_spots
 
@@ -32,9 +34,16 @@ def main() -> int:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     unit = Yardstick().unit()
-    finding = _spot_finding()
-    print(f"Y = {1e3 * unit:.2f} ms: threshold and connected components of a 512 x 512 slice")
-    print(f"finding the spots of such a slice: {finding / unit:.1f} Y\n")
+    print(f"Y = {1e3 * unit:.2f} ms: threshold and connected components of a 512 x 512 slice\n")
+    finding = [_finding(side, threshold) for side in (512, 1024) for threshold in (2000.0, AUTO)]
+    for one in finding:
+        print(f"finding the spots of a {one.side} x {one.side} slice, threshold {one.threshold}: {one.ratio:.1f} Y")
+    centres = [_centres(case, arguments.trials) for case in spots.CASES]
+    scanned = artefacts.measure(max(arguments.trials // 40, 2), 6, 1.0, AUTO)
+    print(
+        f"in a scan with metal streaks: {scanned[0]} of {scanned[1]} rods found, RMS {scanned[2]:.3f} pixel, "
+        f"largest error {scanned[3]:.3f}\n"
+    )
     print(
         "frame       rods  false  noise/px  allowed  prior/deg  guess   right  weak  wrong  refused  median/Y   p99/Y  "
         "median/ms"
@@ -68,7 +77,9 @@ def main() -> int:
         )
     record = {
         "yardstick_s": unit,
-        "spot_finding_s": finding,
+        "spot_finding": [asdict(one) for one in finding],
+        "spot_centres": [asdict(row) for row in centres],
+        "spots_in_scan": {"found": scanned[0], "there": scanned[1], "rms_px": scanned[2], "largest_px": scanned[3]},
         "versions": {
             "python": platform.python_version(),
             "numpy": np.__version__,
@@ -84,12 +95,42 @@ def main() -> int:
     return 1 if any(row.wrong for row in rows) else 0
 
 
-def _spot_finding() -> float:
+@dataclass(frozen=True)
+class Finding:
+    """How long it takes to find the spots of a slice, s and as a multiple of the yardstick."""
+
+    side: int
+    threshold: float | str
+    median_s: float
+    ratio: float
+
+
+def _finding(side: int, threshold: float | str) -> Finding:
     frame = load_frame("cube6")
     rng = np.random.default_rng(0)
-    settings = ScannerSettings(false_spots=8)
+    spacing = 256.0 / side
+    settings = ScannerSettings(false_spots=8, shape=(side, side), scale=PixelScale(spacing, spacing))
     ct_slice = render_slice([PlacedFrame(frame, random_pose(rng, frame, settings))], settings, rng)
-    return median(seconds_of(lambda: find_spots(ct_slice, RegistrationOptions())) for _ in range(100))
+    options, yardstick = RegistrationOptions(threshold=threshold), Yardstick()
+    times, units = [], []
+    for _ in range(150):
+        times.append(seconds_of(lambda: find_spots(ct_slice, options)))
+        units.append(yardstick.once())
+    return Finding(side, threshold, median(times), median(times) / median(units))
+
+
+def _centres(case: spots.Case, trials: int) -> spots.Row:
+    row = spots.measure(case, trials)
+    if case is spots.CASES[0]:
+        print(
+            "\ncentres of spots       found  wrong   RMS/px  bias/px  along/px  across/px  x bound  NEES (2 is right)"
+        )
+    print(
+        f"{case.name:24s} {row.found:4d}  {row.wrong:5d}  {row.rms_px:7.4f}  {row.bias_px:7.4f}  {row.along_px:8.4f}  "
+        f"{row.across_px:9.4f}  {row.ratio:7.2f}  {row.nees:4.2f}",
+        flush=True,
+    )
+    return row
 
 
 if __name__ == "__main__":

@@ -231,9 +231,11 @@ def _checked(covariances_px2: ArrayLike | None, spots: int) -> Array:
     covariances = np.asarray(covariances_px2, dtype=np.float64)
     if covariances.shape != (spots, 2, 2):
         raise ValueError(f"covariances_px2 has shape {covariances.shape}, expected ({spots}, 2, 2)")
-    if not np.isfinite(covariances).all() or not np.array_equal(covariances, np.swapaxes(covariances, 1, 2)):
+    turned = np.swapaxes(covariances, 1, 2)
+    if not np.isfinite(covariances).all() or not np.allclose(covariances, turned, rtol=1e-6, atol=1e-12):
         raise ValueError("covariances_px2 must be finite and symmetric")
-    if spots and np.linalg.eigvalsh(covariances).min() < 0:
+    covariances = 0.5 * (covariances + turned)
+    if spots and np.linalg.eigvalsh(covariances).min() < -1e-9:
         raise ValueError("covariances_px2 holds a matrix with a negative variance")
     return covariances
 

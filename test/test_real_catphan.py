@@ -60,6 +60,25 @@ def test_shipped_wires_are_those_of_the_training_slices(scan, frame):
             np.testing.assert_allclose(fitted, end, atol=0.02, err_msg=name)
 
 
+def test_centres_of_each_wire_lie_on_a_straight_line(scan):
+    """In the slices through which the wires run from one side to the other: all but the first and the last."""
+    inner = [one.ct_slice for one in scan if shows_module(one)][1:-1]
+    points: dict[str, list[np.ndarray]] = {name: [] for name in PLACES}
+    for ct_slice in inner:
+        mm = ct_slice.scale.to_mm(find_spots(ct_slice, CATPHAN_OPTIONS).centres_px)
+        placed = ct_slice.scanner_from_slice @ np.column_stack([mm, np.zeros(len(mm))]) - ORIGIN_MM
+        for name, (x, y, far_x, far_y) in PLACES.items():
+            near = (np.abs(placed[:, 0] - x) < far_x) & (np.abs(placed[:, 1] - y) < far_y)
+            points[name].extend(placed[near])
+    for name, on_line in points.items():
+        assert len(on_line) == len(inner), name
+        off = np.array(on_line) - np.mean(on_line, axis=0)
+        direction = np.linalg.svd(off)[2][0]
+        rms = np.sqrt((np.linalg.norm(off - np.outer(off @ direction, direction), axis=1) ** 2).mean())
+        print(f"{name}: {rms:.3f} mm RMS from a straight line over {len(on_line)} slices")
+        assert rms <= 0.10
+
+
 def test_slices_that_show_the_module_are_accepted_and_step_with_the_table(scan, frame):
     found = {}
     for one in filter(shows_module, scan):

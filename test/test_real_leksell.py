@@ -10,6 +10,7 @@ from real_images import LEKSELL_OPTIONS, leksell
 
 from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.geometry.pose import rotation_angle
+from stereoreg_ros.spots import find_spots
 
 # Where the six rods are to be seen, pixel (u, v), by the data's own description.
 RODS_PX = np.array([[105.5, 162.3], [108.3, 246.9], [111.4, 354.3], [408.9, 153.1], [411.5, 232.9], [414.5, 345.0]])
@@ -25,7 +26,7 @@ def frame():
     return load_frame("leksell_ct")
 
 
-@pytest.mark.parametrize("threshold", [800.0, 900.0, 1000.0, 1200.0])
+@pytest.mark.parametrize("threshold", [800.0, 900.0, 1000.0, 1200.0, "auto"])
 def test_without_prior_is_ambiguous_and_lists_the_four_poses(ct_slice, frame, threshold):
     result = register_slice(ct_slice, frame, replace(LEKSELL_OPTIONS, threshold=threshold, max_rotation_deg=180.0))
     assert not result
@@ -40,7 +41,7 @@ def test_without_prior_is_ambiguous_and_lists_the_four_poses(ct_slice, frame, th
         assert f"({x:.1f}, {y:.1f}, {z:.1f})" in result.message
 
 
-@pytest.mark.parametrize("threshold", [800.0, 900.0, 1000.0, 1200.0])
+@pytest.mark.parametrize("threshold", [800.0, 900.0, 1000.0, 1200.0, "auto"])
 def test_with_prior_is_accepted(ct_slice, frame, threshold):
     result = register_slice(ct_slice, frame, replace(LEKSELL_OPTIONS, threshold=threshold))
     assert result, result.message
@@ -50,6 +51,14 @@ def test_with_prior_is_accepted(ct_slice, frame, threshold):
     np.testing.assert_allclose(found, RODS_PX, atol=0.5)
     # The slice is nearly at right angles to the upright rods: the tilt is known only weakly, and that is said.
     assert result.estimate.rotation_std_deg >= 0.5
+
+
+def test_auto_offers_the_six_rods_and_hardly_more(ct_slice):
+    found = find_spots(ct_slice, replace(LEKSELL_OPTIONS, threshold="auto")).centres_px
+    for rod in RODS_PX:
+        assert np.linalg.norm(found - rod, axis=1).min() < 1.0
+    print(f"{len(found) - 6} besides the six rods")
+    assert len(found) <= 9
 
 
 def test_each_of_the_four_poses_is_accepted_when_the_prior_names_it(ct_slice, frame):

@@ -10,6 +10,7 @@ from real_images import ZFRAME_OPTIONS, height, zframe
 
 from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.geometry.pose import Pose
+from stereoreg_ros.spots import find_spots
 
 FULL = range(6, 12)  # the slices that show all seven tubes
 
@@ -24,19 +25,26 @@ def frame():
     return load_frame("zframe")
 
 
-def test_without_prior_is_honestly_ambiguous(volume, frame):
+THRESHOLDS = pytest.mark.parametrize("threshold", [200.0, "auto"])
+
+
+@THRESHOLDS
+def test_without_prior_is_honestly_ambiguous(volume, frame, threshold):
     for number in FULL:
-        result = register_slice(volume[number].ct_slice, frame, replace(ZFRAME_OPTIONS, max_rotation_deg=180.0))
+        options = replace(ZFRAME_OPTIONS, threshold=threshold, max_rotation_deg=180.0)
+        result = register_slice(volume[number].ct_slice, frame, options)
         assert not result
         assert result.reason == "ambiguous"
         assert len(result.estimates) == 2
 
 
-def test_with_prior_is_accepted_and_steps_with_the_table(volume, frame):
+@THRESHOLDS
+def test_with_prior_is_accepted_and_steps_with_the_table(volume, frame, threshold):
+    options = replace(ZFRAME_OPTIONS, threshold=threshold)
     heights = []
     for number in FULL:
         one = volume[number].ct_slice
-        result = register_slice(replace(one, scanner_from_slice=Pose.identity()), frame, ZFRAME_OPTIONS)
+        result = register_slice(replace(one, scanner_from_slice=Pose.identity()), frame, options)
         assert result, f"slice {number}: {result.message}"
         assert result.estimate.inliers == 7
         assert result.estimate.residual_rms_mm <= 0.4
@@ -49,8 +57,15 @@ def test_with_prior_is_accepted_and_steps_with_the_table(volume, frame):
     assert np.sqrt(np.mean((steps - 2.4) ** 2)) <= 0.3
 
 
-def test_slices_without_the_frame_are_refused(volume, frame):
+def test_auto_offers_the_seven_tubes_and_hardly_more(volume):
+    for number in FULL:
+        found = find_spots(volume[number].ct_slice, replace(ZFRAME_OPTIONS, threshold="auto"))
+        assert 7 <= len(found) <= 9, number
+
+
+@THRESHOLDS
+def test_slices_without_the_frame_are_refused(volume, frame, threshold):
     for number, one in enumerate(volume):
         if number not in range(5, 12):
-            result = register_slice(one.ct_slice, frame, ZFRAME_OPTIONS)
+            result = register_slice(one.ct_slice, frame, replace(ZFRAME_OPTIONS, threshold=threshold))
             assert not result

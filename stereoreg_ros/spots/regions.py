@@ -12,11 +12,15 @@ from stereoreg_ros.geometry.pose import Array
 
 # Of more things that stand out than this the strongest are looked at, so many at once.
 _MOST_PEAKS: Final = 96
-_AT_ONCE: Final = 24
+_AT_ONCE: Final = 32
 # Directions in which the surroundings of a peak are sampled.
 _DIRECTIONS: Final = 16
 # Standard deviations of the noise by which a peak must stand out.
 _STANDS_OUT: Final = 8.0
+# Median absolute difference of two normal variables, of their standard deviation.
+_MEDIAN_OF_DIFFERENCES: Final = 0.954
+# Smaller regions are one spot, pixels.
+_LEAST_TO_PART: Final = 5
 # The rods of a frame are alike; one that leans is spread over more pixels, and fainter, but not below this share.
 _FAINTEST: Final = 0.3
 # The mean brightness around is taken on a coarser grid, of so many pixels.
@@ -42,7 +46,10 @@ class Regions(NamedTuple):
 
 
 def regions_above(hu: NDArray[np.float32], threshold: float, fewest: float, most: float) -> Regions:
-    """8-connected regions above a threshold, of `fewest` to `most` pixels, that do not touch the image's edge."""
+    """8-connected regions above a threshold, of `fewest` to `most` pixels, that do not touch the image's edge.
+
+    A region of two spots that touch falls apart at half its height above the threshold: each part is a region then.
+    """
     _, labels, stats, _ = cv2.connectedComponentsWithStats((hu > threshold).view(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
     first = stats[:, [cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP]].astype(np.intp)
@@ -50,7 +57,46 @@ def regions_above(hu: NDArray[np.float32], threshold: float, fewest: float, most
     fits = (area >= fewest) & (area <= most) & _is_whole(first, extent, hu.shape)
     fits[0] = False  # label 0 is the background
     label = np.flatnonzero(fits)
-    return Regions(np.asarray(labels), label, first[label], extent[label])
+    regions = Regions(np.asarray(labels), label, first[label], extent[label])
+    return _parted(hu, np.full(len(label), threshold), fewest, regions)
+
+
+def _parted(hu: NDArray[np.float32], floors: Array, fewest: float, regions: Regions) -> Regions:
+    """The regions, those that fall apart in their parts; floors: (n,), above which each region is."""
+    labels, highest = regions.labels, int(regions.labels.max(initial=0))
+    whole = np.ones(len(regions.label), dtype=bool)
+    parts: list[tuple[int, list[int], list[int]]] = []
+    for row in np.flatnonzero((regions.extent >= _LEAST_TO_PART).any(axis=1)):
+        (left, top), (width, height) = regions.first[row].tolist(), regions.extent[row].tolist()
+        box = np.s_[top : top + height, left : left + width]
+        value = np.where(labels[box] == regions.label[row], hu[box] - floors[row], 0.0)
+        half = 0.5 * float(value.max())
+        count, inner, stats, _ = cv2.connectedComponentsWithStats((value > half).view(np.uint8), connectivity=8)
+        if count <= 2:
+            continue
+        # Noise makes parts too, but hardly so high ones.
+        least = max(half / 2, _STANDS_OUT * _noise(hu))
+        high = [one for one in range(1, count) if float(value[inner == one].max()) - half >= least]
+        high = [one for one in high if stats[one, cv2.CC_STAT_AREA] >= min(fewest, 3)]
+        if len(high) < 2:
+            continue
+        whole[row] = False
+        labels[box][labels[box] == regions.label[row]] = 0  # what lies between the parts is no other thing
+        for one in high:
+            highest += 1
+            labels[box][inner == one] = highest
+            inner_left, inner_top, inner_width, inner_height = stats[one, :4].tolist()
+            parts.append((highest, [left + inner_left, top + inner_top], [inner_width, inner_height]))
+    if not parts:
+        return regions
+    label, first, extent = (np.array(column, dtype=np.intp) for column in zip(*parts, strict=True))
+    kept = regions.take(whole)
+    return Regions(
+        labels,
+        np.concatenate([kept.label, label]),
+        np.concatenate([kept.first, first]),
+        np.concatenate([kept.extent, extent]),
+    )
 
 
 def regions_by_contrast(hu: NDArray[np.float32], fewest: float, most: float, least_rods: int) -> Regions:
@@ -59,11 +105,12 @@ def regions_by_contrast(hu: NDArray[np.float32], fewest: float, most: float, lea
     They have `fewest` to `most` pixels and do not touch the image's edge. Where a frame shows, the `least_rods`
     strongest are rods or brighter: those that are far fainter are left out.
     """
-    radius = int(np.sqrt(most / np.pi)) + 2
+    radius = int(np.sqrt(most / np.pi)) + 4
     reach = radius + 3
     u, v, level, height = _peaks(hu, radius)
     labels = np.zeros(hu.shape, dtype=np.int32)
     heights: list[float] = []
+    floors: list[float] = []
     firsts, extents = [np.empty((0, 2), dtype=np.intp)], [np.empty((0, 2), dtype=np.intp)]
     for start in range(0, len(u), _AT_ONCE):
         if len(heights) >= least_rods and height[start] < _FAINTEST * heights[least_rods - 1]:
@@ -80,10 +127,17 @@ def regions_by_contrast(hu: NDArray[np.float32], fewest: float, most: float, lea
             if labels[inside].any():
                 continue  # another peak of the same region
             heights.append(float(height[peak]))
+            floors.append(float(level[peak] + 0.5 * height[peak]))
             labels[inside] = len(heights)
             firsts.append(first[row : row + 1])
             extents.append(extent[row : row + 1])
-    return Regions(labels, np.arange(1, len(heights) + 1), np.concatenate(firsts), np.concatenate(extents))
+    regions = Regions(labels, np.arange(1, len(heights) + 1), np.concatenate(firsts), np.concatenate(extents))
+    return _parted(hu, np.array(floors), fewest, regions)
+
+
+def _noise(hu: NDArray[np.float32]) -> float:
+    """Standard deviation of the noise, HU: by neighbouring pixels' differences, of which most have no other reason."""
+    return float(np.median(np.abs(np.diff(hu[::16], axis=1)))) / _MEDIAN_OF_DIFFERENCES if hu.shape[1] > 1 else 0.0
 
 
 def _is_whole(first: NDArray[np.intp], extent: NDArray[np.intp], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -99,12 +153,11 @@ def _peaks(hu: NDArray[np.float32], radius: int) -> tuple[NDArray[np.intp], NDAr
     smooth = np.asarray(cv2.GaussianBlur(hu, (3, 3), 0.8))
     highest = cv2.dilate(smooth, np.ones((5, 5), np.uint8))
     v, u = np.divmod(np.flatnonzero(smooth == highest), hu.shape[1])
-    coarse = np.asarray(cv2.resize(hu, None, fx=1 / _COARSE, fy=1 / _COARSE, interpolation=cv2.INTER_AREA))
+    coarse_size = -(-hu.shape[1] // _COARSE), -(-hu.shape[0] // _COARSE)
+    coarse = np.asarray(cv2.resize(hu, coarse_size, interpolation=cv2.INTER_AREA))
     coarse = cv2.blur(coarse, (2 * radius // _COARSE + 1, 2 * radius // _COARSE + 1))
-    at = np.minimum(v // _COARSE, coarse.shape[0] - 1), np.minimum(u // _COARSE, coarse.shape[1] - 1)
-    contrast = smooth[v, u] - coarse[at]
-    noise = float(np.median(np.abs(np.diff(hu[::16], axis=1)))) / 0.954 if hu.shape[1] > 1 else 0.0
-    least = max(_STANDS_OUT * noise, 1.0)
+    contrast = smooth[v, u] - coarse[v // _COARSE, u // _COARSE]
+    least = max(_STANDS_OUT * _noise(hu), 1.0)
     rows = np.flatnonzero(contrast > least)
     if len(rows) > _MOST_PEAKS:
         rows = rows[np.argpartition(-contrast[rows], _MOST_PEAKS)[:_MOST_PEAKS]]
