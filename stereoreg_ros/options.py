@@ -61,16 +61,7 @@ class RegistrationOptions:
     )
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            low, high = entry.metadata["low"], entry.metadata["high"]
-            value = getattr(self, entry.name)
-            word = entry.metadata["word"]
-            if low is None or (word is not None and value == word):
-                continue
-            number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-            if not number or not low <= value <= high:
-                or_word = f", or '{word}'" if word else ""
-                raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}{or_word}")
+        _check_ranges(self)
         if int(self.min_inliers) != self.min_inliers:
             raise ValueError(f"min_inliers is {self.min_inliers!r}, expected a whole number")
         if self.matcher not in MATCHERS:
@@ -86,3 +77,38 @@ class RegistrationOptions:
             raise ValueError(f"nominal_orientation: {error}") from None
         object.__setattr__(self, "min_inliers", int(self.min_inliers))
         object.__setattr__(self, "nominal_orientation", tuple(float(q) for q in self.nominal_orientation))
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """How to measure the pixel scale; the fields are the node's parameters of the same names.
+
+    Raises ValueError, naming the field, what was found and what was expected.
+    """
+
+    calibration_slices: int = _option(10, "how many of the last slices recalibration uses", 1, 200)
+    calibrate_shear: bool = _option(False, "whether recalibration measures the shear of the pixel grid too")
+    calibration_max_change: float = _option(
+        0.15, "largest change of the pixel spacing that recalibration may make, as a share of it", 0.001, 0.5
+    )
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if int(self.calibration_slices) != self.calibration_slices:
+            raise ValueError(f"calibration_slices is {self.calibration_slices!r}, expected a whole number")
+        if not isinstance(self.calibrate_shear, bool):
+            raise ValueError(f"calibrate_shear is {self.calibrate_shear!r}, expected true or false")
+        object.__setattr__(self, "calibration_slices", int(self.calibration_slices))
+
+
+def _check_ranges(options: RegistrationOptions | CalibrationOptions) -> None:
+    for entry in fields(options):
+        low, high = entry.metadata["low"], entry.metadata["high"]
+        value = getattr(options, entry.name)
+        word = entry.metadata["word"]
+        if low is None or (word is not None and value == word):
+            continue
+        number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+        if not number or not low <= value <= high:
+            or_word = f", or '{word}'" if word else ""
+            raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}{or_word}")

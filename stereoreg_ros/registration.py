@@ -145,7 +145,7 @@ def _register(
     """Match, judge, accept or refuse; see `register_spots`."""
 
     def refuse(reason: Reason, message: str, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
-        return Refusal(frame, scale, spots_px, reason, message, estimates)
+        return Refusal(frame, scale, spots_px, reason, message, estimates, covariances_px2)
 
     count = len(spots_px)
     if count < options.min_inliers:
@@ -153,7 +153,7 @@ def _register(
     if count > MAX_SPOTS:
         return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
 
-    covariances_mm2 = scale.matrix @ _at_least(covariances_px2, options.spot_noise_px) @ scale.matrix.T
+    covariances_mm2 = scale.matrix @ at_least(covariances_px2, options.spot_noise_px) @ scale.matrix.T
     spots = Spots.of(scale.to_mm(spots_px), covariances_mm2, slice_area_mm2, streaks)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
@@ -213,7 +213,7 @@ def _register(
             f"weakly determined: standard deviation {best.position_std_mm:.2f} mm, {best.rotation_std_deg:.2f} degrees"
         )
     caution = "; ".join(cautions)
-    return Registration(frame, scale, options, spots_px, best, caution)
+    return Registration(frame, scale, options, spots_px, best, caution, covariances_px2)
 
 
 def _streaks(found: FoundSpots, scale: PixelScale, thickness_mm: float) -> Streaks:
@@ -240,7 +240,7 @@ def _checked(covariances_px2: ArrayLike | None, spots: int) -> Array:
     return covariances
 
 
-def _at_least(covariances_px2: Array, noise_px: float) -> Array:
+def at_least(covariances_px2: Array, noise_px: float) -> Array:
     """Covariances (n, 2, 2) without a direction of a smaller standard deviation than noise_px."""
     if not covariances_px2.any():
         return np.tile(noise_px**2 * np.eye(2), (len(covariances_px2), 1, 1))

@@ -101,7 +101,8 @@ class Registration:
     """An accepted slice. True as a condition.
 
     options: what it was made with; estimate: the pose and all that supports it; spots_px: (n, 2), all spots offered;
-    caution: a sentence where the pose is accepted but something deserves a look, else empty.
+    caution: a sentence where the pose is accepted but something deserves a look, else empty. covariances_px2: (n, 2, 2)
+    of the spots' centres, as their image shows them; None where nothing is known of that.
     """
 
     frame: Frame
@@ -110,6 +111,7 @@ class Registration:
     spots_px: Array
     estimate: PoseEstimate
     caution: str = ""
+    covariances_px2: Array | None = None
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -144,6 +146,7 @@ class Refusal:
     reason: Reason
     message: str
     estimates: tuple[PoseEstimate, ...] = ()
+    covariances_px2: Array | None = None
 
     def __bool__(self) -> Literal[False]:
         return False
