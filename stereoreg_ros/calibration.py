@@ -322,7 +322,7 @@ def _judged(
         return CalibrationRefusal("calibration refused: the joint solution did not converge")
     if joint.degrees_of_freedom < _LEAST_FREEDOM:
         return CalibrationRefusal(
-            f"calibration refused: {len(matched)} slice with {found.rods} rods leaves too little to check the scale by; "
+            f"calibration refused: {found.rods} rods in {len(matched)} slice leave too little to check the scale by, "
             "another slice or another rod is needed"
         )
     _, _, spots_px, used, covariances = _posed(frame, matched)

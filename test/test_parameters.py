@@ -47,7 +47,7 @@ def test_descriptor(entry):
     if isinstance(entry.default, float):
         (bounds,) = descriptor.floating_point_range
         assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0.0)
-    elif isinstance(entry.default, int):
+    elif isinstance(entry.default, int) and not isinstance(entry.default, bool):
         (bounds,) = descriptor.integer_range
         assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0)
     elif isinstance(entry.default, tuple):

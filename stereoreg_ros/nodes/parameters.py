@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 
 _SPACING_RANGE_MM = (0.001, 100.0)
 
@@ -104,6 +104,7 @@ class NodeSettings:
     """
 
     options: RegistrationOptions
+    calibration: CalibrationOptions
     frame_file: str = setting("cube6", "frame file: a path, or the name of a shipped frame")
     pixel_spacing: tuple[float, float] = setting(
         (0.0, 0.0), "pixel spacing [sx, sy]: between columns, between rows, mm/pixel; [0, 0]: not told yet"
@@ -113,6 +114,10 @@ class NodeSettings:
     rescale_intercept: float = setting(0.0, "HU = value * rescale_slope + rescale_intercept", -1e6, 1e6)
     scanner_frame_id: str = setting("", "frame_id of the scanner in all messages; empty: the image's frame_id")
     fiducial_frame_id: str = setting("stereotactic_frame", "name of the stereotactic frame's axes in messages")
+    calibration_timeout: float = setting(5.0, "how long recalibration waits for slices that it can use, s", 0.0, 600.0)
+    calibration_file: str = setting(
+        "", "file that keeps a measured pixel spacing over a restart; empty: it is forgotten"
+    )
 
     def __post_init__(self) -> None:
         for entry in entries_of(type(self)):
@@ -136,10 +141,15 @@ class NodeSettings:
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any]) -> NodeSettings:
         """Settings from the values of all parameters by name."""
-        names = {entry.name for entry in entries_of(RegistrationOptions)}
-        options = {name: value for name, value in values.items() if name in names}
-        own = {name: value for name, value in values.items() if name not in names}
-        return cls(options=RegistrationOptions(**options), **own)
+
+        def of(settings: type) -> dict[str, Any]:
+            return {entry.name: values[entry.name] for entry in entries_of(settings) if entry.name in values}
+
+        options, calibration = (
+            RegistrationOptions(**of(RegistrationOptions)),
+            CalibrationOptions(**of(CalibrationOptions)),
+        )
+        return cls(options=options, calibration=calibration, **of(cls))
 
     @property
     def scale(self) -> PixelScale | None:
@@ -147,7 +157,7 @@ class NodeSettings:
         return PixelScale(*self.pixel_spacing, self.pixel_shear) if self.pixel_spacing != (0.0, 0.0) else None
 
 
-ENTRIES = (*entries_of(NodeSettings), *entries_of(RegistrationOptions))
+ENTRIES = (*entries_of(NodeSettings), *entries_of(RegistrationOptions), *entries_of(CalibrationOptions))
 
 
 def declare_settings(node: Node) -> NodeSettings:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 import time
 import traceback
+from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -19,7 +21,14 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from stereoreg_ros.calibration import calibrate
+from stereoreg_ros.calibration import Sighting, sighting_of
+from stereoreg_ros.calibration_file import (
+    CalibrationFileError,
+    CalibrationRecord,
+    load_calibration,
+    remove_calibration,
+    save_calibration,
+)
 from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
@@ -30,6 +39,7 @@ from stereoreg_ros.nodes.conversions import MessageError
 from stereoreg_ros.nodes.diagnostic_status import status_of, status_of_unusable
 from stereoreg_ros.nodes.markers import markers_of
 from stereoreg_ros.nodes.parameters import changed_settings, declare_settings
+from stereoreg_ros.nodes.recalibration import NextTurn, Recalibration
 from stereoreg_ros.nodes.slice_poses import WAIT_S, SlicePoses
 from stereoreg_ros.nodes.spinning import run
 from stereoreg_ros.registration import register_slice
@@ -39,6 +49,7 @@ from stereoreg_ros.result import Reason, Refusal, Registration
 _QUEUE = 10
 _LOOK_FOR_OVERDUE_S = 0.1
 _REPEAT_WARNING_S = 5.0
+_POLL_S = 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +75,8 @@ class RegisterNode(Node):
         self._slice_pose_seen = False
         self._target: PointStamped | None = None
         self._latest: _Accepted | None = None
-        self._last_accepted: Registration | None = None
+        self._sightings: deque[Sighting] = deque(maxlen=self._settings.calibration.calibration_slices)
+        self._recalibration: Recalibration | None = None
 
         self._pose = self.create_publisher(PoseStamped, "pose", _QUEUE)
         self._pose_with_covariance = self.create_publisher(PoseWithCovarianceStamped, "pose_with_covariance", _QUEUE)
@@ -74,13 +86,14 @@ class RegisterNode(Node):
         self._markers = self.create_publisher(MarkerArray, "markers", _QUEUE)
         # The pose before the image: where both are there, rclpy serves them in this order and no image has to wait.
         self._slice_pose_input = self.create_subscription(PoseStamped, "slice_pose", self._on_slice_pose, _QUEUE)
-        self.create_subscription(Image, "image", self._on_image, _QUEUE)
+        self._image_input = self.create_subscription(Image, "image", self._on_image, _QUEUE)
         self.create_subscription(PointStamped, "target", self._on_target, _QUEUE)
         self.create_service(Trigger, "~/recalibrate", self._on_recalibrate)
         self.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
         self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
+        self._load_calibration()
         self.get_logger().info(f"ready, frame {self._settings.frame_file}")
 
     # From an image to a pose, in the order of the data.
@@ -134,6 +147,8 @@ class RegisterNode(Node):
             self.get_logger().error(f"internal error while registering an image\n{traceback.format_exc()}")
             self._refuse_unusable("bad_image", f"internal error: {type(error).__name__}: {error}", header, started)
             return
+        if len(result.spots_px) >= self._settings.options.min_inliers:
+            self._sightings.append(sighting_of(result, ct_slice.hu.size, ct_slice.scanner_from_slice))
         if result:
             self._publish_pose(result, header)
         else:
@@ -158,7 +173,6 @@ class RegisterNode(Node):
         with_covariance.pose.covariance = conversions.covariance_to_message(registration.covariance)
         self._pose_with_covariance.publish(with_covariance)
         self._latest = _Accepted(header, registration)
-        self._last_accepted = registration
         self._publish_target_in_frame()
 
     def _refuse_unusable(self, reason: Reason, message: str, header: Header, started: float) -> None:
@@ -234,32 +248,104 @@ class RegisterNode(Node):
 
     # The pixel scale.
 
-    def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._last_accepted is None:
+    async def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._recalibration is not None:
+            response.success, response.message = False, "a recalibration is running already, wait for its answer"
+            return response
+        settings, frame = self._settings, self._frame
+        if frame is None or settings.scale is None or not (self._sightings or self._images_come()):
             response.success, response.message = False, "no slice has been accepted yet, nothing to calibrate from"
             return response
+        wait_s = settings.calibration_timeout if self._images_come() else 0.0
+        self._recalibration = Recalibration(
+            frame, settings.scale, settings.options, settings.calibration, time.monotonic() + wait_s
+        )
         try:
-            calibration = calibrate(self._last_accepted)
+            response.success, response.message = await self._recalibrate(self._recalibration)
         except Exception as error:
             self.get_logger().error(f"internal error in recalibrate\n{traceback.format_exc()}")
             response.success, response.message = False, f"internal error: {type(error).__name__}: {error}"
-            return response
-        response.success, response.message = bool(calibration), calibration.message
-        if calibration:
-            fault = self._set_scale(calibration.scale, "measured")
-            if fault:
-                response.success, response.message = False, f"the measured scale cannot be set: {fault}"
+        finally:
+            self._recalibration.close()
+            self._recalibration = None
         return response
 
+    async def _recalibrate(self, recalibration: Recalibration) -> tuple[bool, str]:
+        """Whether the scale was changed, and the sentence for the operator."""
+        while (outcome := recalibration.poll(self._sightings, time.monotonic())) is None:
+            # Slices have their turn meanwhile; the sleep leaves the processor to the thread that measures.
+            time.sleep(_POLL_S)
+            await NextTurn()
+        if self._frame is not recalibration.frame or self._settings.scale != recalibration.scale:
+            return False, "calibration refused: the frame or the pixel spacing was changed meanwhile"
+        if not outcome:
+            return False, outcome.message
+        configured = self._configured_scale or recalibration.scale
+        fault = self._set_scale(outcome.scale, "measured")
+        if fault:
+            return False, f"the measured scale cannot be set: {fault}"
+        self._configured_scale = configured
+        if not self._settings.calibration_file:
+            return True, outcome.message
+        path = Path(self._settings.calibration_file)
+        try:
+            save_calibration(path, CalibrationRecord.of(outcome, configured, recalibration.frame.name))
+        except OSError as error:
+            self.get_logger().warning(f"calibration_file {path} cannot be written: {error}")
+            return True, f"{outcome.message}; but it will be forgotten: {path} cannot be written: {error.strerror}"
+        return True, outcome.message
+
+    def _images_come(self) -> bool:
+        return self.count_publishers(self._image_input.topic_name) > 0
+
     def _on_reset_calibration(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._recalibration is not None:
+            response.success, response.message = False, "a recalibration is running, wait for its answer"
+            return response
         if self._configured_scale is None:
             response.success, response.message = False, "pixel_spacing has not been configured, nothing to go back to"
             return response
+        if self._settings.calibration_file:
+            path = Path(self._settings.calibration_file)
+            try:
+                remove_calibration(path)
+            except OSError as error:
+                response.success = False
+                response.message = f"calibration_file {path} cannot be removed: {error.strerror}; nothing was changed"
+                return response
         fault = self._set_scale(self._configured_scale, "configured")
         scale = self._configured_scale
         back = f"pixel_spacing is the configured one, [{scale.sx:.9g}, {scale.sy:.9g}] mm/pixel"
         response.success, response.message = not fault, fault or back
         return response
+
+    def _load_calibration(self) -> None:
+        """Take up what was measured before the restart, where that can be trusted."""
+        if not self._settings.calibration_file:
+            return
+        path = Path(self._settings.calibration_file)
+        try:
+            record = load_calibration(path)
+        except CalibrationFileError as error:
+            self.get_logger().warning(f"calibration_file is not used, the configured pixel_spacing is: {error}")
+            return
+        if record is None:
+            return
+        configured = self._settings.scale
+        if configured is None or not record.replaces(configured):
+            told = "not told" if configured is None else f"[{configured.sx:.6g}, {configured.sy:.6g}]"
+            self.get_logger().warning(
+                f"calibration_file is not used: {path} was measured in place of the pixel_spacing "
+                f"[{record.configured.sx:.6g}, {record.configured.sy:.6g}], which is {told}"
+            )
+            return
+        fault = self._set_scale(record.scale, "measured")
+        if fault:
+            self.get_logger().warning(f"calibration_file is not used: {path}: {fault}")
+            return
+        self.get_logger().info(
+            f"pixel_spacing [{record.scale.sx:.6g}, {record.scale.sy:.6g}] as measured on {record.date}, from {path}"
+        )
 
     def _set_scale(self, scale: PixelScale, calibration: Literal["configured", "measured"]) -> str:
         """Change the scale's parameters as one; returns why they cannot be, or nothing."""
@@ -299,6 +385,9 @@ class RegisterNode(Node):
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         names = {parameter.name for parameter in parameters}
+        if "calibration_slices" in names:
+            most = changed_settings(self, []).calibration.calibration_slices
+            self._sightings = deque(self._sightings, maxlen=most)
         scale_before, self._settings = self._settings.scale, changed_settings(self, [])
         if "frame_file" in names:
             self._frame, self._frame_fault = self._checked_frame, ""
@@ -310,7 +399,8 @@ class RegisterNode(Node):
 
     def _forget_slices(self) -> None:
         """A slice seen under another frame or scale says nothing about this one."""
-        self._latest = self._last_accepted = None
+        self._latest = None
+        self._sightings.clear()
 
 
 def main() -> int:

@@ -53,7 +53,7 @@ def calibrate_jointly(
     the normal equations slice by slice (Schur complement), so that the work grows with m and not with its cube.
     """
     size = 3 if with_shear else 2
-    whitening: Array = np.linalg.inv(np.linalg.cholesky(np.where(used[..., None, None], covariances_px2, np.eye(2))))
+    whitening = _inverse(np.linalg.cholesky(np.where(used[..., None, None], covariances_px2, np.eye(2))))
     target = np.where(used[..., None], spots_px, 0.0)
     state = _evaluate(frame, rotations, translations, target, used, whitening, scale, size)
     damping, converged = _FIRST_DAMPING, False
@@ -77,7 +77,9 @@ def calibrate_jointly(
             if damping > _LARGEST_DAMPING:
                 converged = True  # no step however short helps: at the optimum to rounding
                 break
-    covariance = np.linalg.pinv(state.reduced()[0])
+    # A direction that nothing determines gets a huge variance, not none.
+    values, vectors = np.linalg.eigh(state.reduced()[0])
+    covariance: Array = (vectors / np.maximum(values, 1e-12 * max(float(values[-1]), 1e-12))) @ vectors.T
     freedom = int(2 * used.sum()) - 6 * len(rotations) - size
     return JointScale(
         scale, covariance, rotations, translations, state.residuals_px, state.chi_square, freedom, converged
@@ -101,19 +103,23 @@ class _State:
         blocks = self.by_pose.copy()
         diagonal = np.einsum("mii->mi", blocks)
         diagonal += damping * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-12
-        inverse: Array = np.asarray(np.linalg.inv(blocks), dtype=np.float64)
+        inverse = _inverse(blocks)
         weighted = np.swapaxes(self.between, 1, 2) @ inverse
-        information = self.by_scale - (weighted @ self.between).sum(axis=0)
+        information: Array = self.by_scale - (weighted @ self.between).sum(axis=0)
         gradient = self.scale_gradient - (weighted @ self.pose_gradient[..., None])[..., 0].sum(axis=0)
         return information, gradient, inverse
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Steps of the scale (q,) and of the poses (m, 6)."""
         information, gradient, inverse = self.reduced(damping)
-        information = information + damping * np.diag(np.diag(self.by_scale))
-        by_scale: Array = np.linalg.lstsq(information, gradient, rcond=None)[0]
+        damped: Array = information + damping * np.diag(np.diag(self.by_scale))
+        by_scale = np.asarray(np.linalg.lstsq(damped, gradient, rcond=None)[0], dtype=np.float64)
         left = self.pose_gradient - self.between @ by_scale
         return by_scale, (inverse @ left[..., None])[..., 0]
+
+
+def _inverse(matrices: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
 
 def _evaluate(

@@ -1,0 +1,167 @@
+"""The file that keeps a measured pixel scale over a restart: written as one, believed only if whole and ours."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from stereoreg_ros.calibration import Calibration
+from stereoreg_ros.geometry.slice import PixelScale
+
+_KIND: Final = "stereoreg_ros pixel scale"
+_MOST_BYTES: Final = 65536
+# Two spacings that differ by less are the same one, as a share.
+_SAME: Final = 1e-6
+
+
+class CalibrationFileError(ValueError):
+    """A calibration file that cannot be used; the text names the file, what was found and what was expected."""
+
+
+@dataclass(frozen=True)
+class CalibrationRecord:
+    """What a calibration file says.
+
+    scale: as measured, mm/pixel; configured: the scale in place of which it was measured; standard_errors: of (sx, sy)
+    and perhaps the shear, mm/pixel; frame: name of the frame; slices, rods: from how many; date: ISO 8601; software:
+    version.
+    """
+
+    scale: PixelScale
+    configured: PixelScale
+    standard_errors: tuple[float, ...]
+    frame: str
+    slices: int
+    rods: int
+    date: str
+    software: str
+
+    @classmethod
+    def of(cls, calibration: Calibration, configured: PixelScale, frame: str) -> CalibrationRecord:
+        """The record of a calibration of now."""
+        try:
+            software = version("stereoreg_ros")
+        except PackageNotFoundError:
+            software = "not installed"
+        return cls(
+            calibration.scale,
+            configured,
+            calibration.standard_errors,
+            frame,
+            calibration.slices,
+            calibration.rods,
+            datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            software,
+        )
+
+    def replaces(self, configured: PixelScale) -> bool:
+        """Whether it was measured in place of this configured scale, and not of another scanner's or zoom's."""
+        pairs = ((self.configured.sx, configured.sx), (self.configured.sy, configured.sy))
+        same = all(abs(ours / theirs - 1) <= _SAME for ours, theirs in pairs)
+        return same and abs(self.configured.shear - configured.shear) <= _SAME * configured.sx
+
+
+def save_calibration(path: Path, record: CalibrationRecord) -> None:
+    """Write the file so that whoever reads it, after a crash too, finds the old one or the new one, whole.
+
+    Raises OSError where it cannot be written; the old one then stays.
+    """
+    content = {
+        "kind": _KIND,
+        "pixel_spacing": [record.scale.sx, record.scale.sy],
+        "pixel_shear": record.scale.shear,
+        "standard_errors": list(record.standard_errors),
+        "configured_pixel_spacing": [record.configured.sx, record.configured.sy],
+        "configured_pixel_shear": record.configured.shear,
+        "frame": record.frame,
+        "slices": record.slices,
+        "rods": record.rods,
+        "date": record.date,
+        "software": record.software,
+    }
+    text = yaml.safe_dump(content, sort_keys=False)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def remove_calibration(path: Path) -> None:
+    """Remove the file, if there is one, for good. Raises OSError where that fails."""
+    path.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
+def load_calibration(path: Path) -> CalibrationRecord | None:
+    """What the file says; None where there is none. Raises CalibrationFileError where it cannot be used."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_MOST_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise CalibrationFileError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if len(raw) > _MOST_BYTES:
+        raise CalibrationFileError(f"{path}: larger than {_MOST_BYTES} bytes, expected a calibration file")
+    try:
+        content = yaml.safe_load(raw.decode("utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+        raise CalibrationFileError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict) or content.get("kind") != _KIND:
+        found = content.get("kind") if isinstance(content, dict) else type(content).__name__
+        raise CalibrationFileError(f"{path}: kind is {found!r}, expected {_KIND!r}")
+    scale, old = _scale(path, content, "pixel"), _scale(path, content, "configured_pixel")
+    errors = _numbers(path, content, "standard_errors", 2, 3)
+    texts = {key: content.get(key) for key in ("frame", "date", "software")}
+    counts = {key: content.get(key) for key in ("slices", "rods")}
+    for key, value in texts.items():
+        if not isinstance(value, str):
+            raise CalibrationFileError(f"{path}: {key} is {value!r}, expected a text")
+    for key, value in counts.items():
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise CalibrationFileError(f"{path}: {key} is {value!r}, expected a number of 1 or more")
+    return CalibrationRecord(scale, old, errors, **counts, **texts)  # type: ignore[arg-type]
+
+
+def _scale(path: Path, content: dict[str, Any], which: str) -> PixelScale:
+    sx, sy = _numbers(path, content, f"{which}_spacing", 2)
+    (shear,) = _numbers(path, {f"{which}_shear": [content.get(f"{which}_shear")]}, f"{which}_shear", 1)
+    try:
+        return PixelScale(sx, sy, shear)
+    except ValueError as error:
+        raise CalibrationFileError(f"{path}: {which}_spacing: {error}") from None
+
+
+def _numbers(path: Path, content: dict[str, Any], key: str, *counts: int) -> tuple[float, ...]:
+    values = content.get(key)
+    numbers = isinstance(values, list) and all(
+        isinstance(one, (int, float)) and not isinstance(one, bool) and math.isfinite(one) for one in values
+    )
+    if not isinstance(values, list) or not numbers or len(values) not in counts:
+        expected = " or ".join(str(count) for count in counts)
+        raise CalibrationFileError(f"{path}: {key} is {values!r}, expected {expected} finite numbers")
+    return tuple(float(one) for one in values)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the folder's entry on the disk, not only the file."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,182 @@
+"""The file with the measured scale: whole after a crash, and refused with a sentence where it is not ours."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from stereoreg_ros.calibration_file import (
+    CalibrationFileError,
+    CalibrationRecord,
+    load_calibration,
+    remove_calibration,
+    save_calibration,
+)
+from stereoreg_ros.geometry.slice import PixelScale
+
+RECORD = CalibrationRecord(
+    PixelScale(0.5012, 0.4987, 0.001),
+    PixelScale(0.5, 0.5),
+    (0.0004, 0.0005, 0.0002),
+    "cube6",
+    10,
+    60,
+    "2026-11-24T12:00:00+00:00",
+    "1.0",
+)
+KILLS = 100
+# One process that makes others, which write until they are killed: to start Python for each would take minutes.
+WRITERS = """
+import os, sys
+from dataclasses import replace
+from pathlib import Path
+from test_calibration_file import RECORD
+from stereoreg_ros.calibration_file import save_calibration
+for _ in sys.stdin:
+    child = os.fork()
+    if child:
+        print(child, flush=True)
+        os.waitpid(child, 0)
+        print("gone", flush=True)
+        continue
+    number = 0
+    while True:
+        number += 1
+        save_calibration(Path(sys.argv[1]), replace(RECORD, slices=number, rods=6 * number))
+"""
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "scale.yaml"
+    assert load_calibration(path) is None
+    save_calibration(path, RECORD)
+    assert load_calibration(path) == RECORD
+    newer = replace(RECORD, scale=PixelScale(0.49, 0.51), standard_errors=(0.001, 0.001))
+    save_calibration(path, newer)
+    assert load_calibration(path) == newer
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scale.yaml"]
+    remove_calibration(path)
+    remove_calibration(path)
+    assert load_calibration(path) is None
+
+
+def test_belongs_to_the_scale_in_place_of_which_it_was_measured() -> None:
+    assert RECORD.replaces(PixelScale(0.5, 0.5))
+    assert not RECORD.replaces(PixelScale(0.5, 0.51))
+    assert not RECORD.replaces(PixelScale(0.5, 0.5, 0.01))
+
+
+def test_killed_while_it_writes_the_file_is_the_old_or_the_new_one(tmp_path: Path) -> None:
+    path = tmp_path / "scale.yaml"
+    rng = random.Random(3)
+    found, highest = 0, 0
+    command = [sys.executable, "-W", "ignore", "-c", WRITERS, str(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
+    ) as writers:
+        assert writers.stdin is not None
+        assert writers.stdout is not None
+        for _ in range(KILLS):
+            writers.stdin.write("\n")
+            writers.stdin.flush()
+            child = int(writers.stdout.readline())
+            time.sleep(rng.uniform(0.0, 0.05))  # any moment will do
+            os.kill(child, signal.SIGKILL)
+            assert writers.stdout.readline() == "gone\n"
+            record = load_calibration(path)
+            if record is None:
+                assert found == 0
+                continue
+            found += 1
+            assert record.rods == 6 * record.slices
+            highest = max(highest, record.slices)
+        writers.stdin.close()
+    assert found > KILLS // 2
+    assert highest > 1
+
+
+def test_what_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "scale.yaml"
+    save_calibration(path, RECORD)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_calibration(path, replace(RECORD, slices=1))
+    monkeypatch.undo()
+    assert load_calibration(path) == RECORD
+    assert [entry.name for entry in tmp_path.iterdir()] == ["scale.yaml"]
+
+
+def content() -> dict[str, object]:
+    return {
+        "kind": "stereoreg_ros pixel scale",
+        "pixel_spacing": [0.5, 0.5],
+        "pixel_shear": 0.0,
+        "standard_errors": [0.001, 0.001],
+        "configured_pixel_spacing": [0.5, 0.5],
+        "configured_pixel_shear": 0.0,
+        "frame": "cube6",
+        "slices": 3,
+        "rods": 18,
+        "date": "2026-11-24T12:00:00+00:00",
+        "software": "1.0",
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "kind is 'NoneType', expected 'stereoreg_ros pixel scale'"),
+        ("[1, 2", "not YAML"),
+        ("\xff\xfe", "kind is"),
+        ("!!python/object/apply:os.system [true]", "not YAML"),
+        ("name: cube6\nlines: []\n", "kind is None, expected"),
+        ("a" * 70000, "larger than 65536 bytes"),
+        ({"kind": "other"}, "kind is 'other'"),
+        ({"pixel_spacing": [0.5]}, r"pixel_spacing is \[0.5\], expected 2 finite numbers"),
+        ({"pixel_spacing": [0.5, float("nan")]}, "pixel_spacing is .*, expected 2 finite numbers"),
+        ({"pixel_spacing": [0.5, -0.5]}, "pixel spacing sy is -0.5, expected a positive number"),
+        ({"pixel_shear": "x"}, r"pixel_shear is \['x'\], expected 1 finite numbers"),
+        ({"standard_errors": [True, 1]}, "standard_errors is .*, expected 2 or 3 finite numbers"),
+        ({"slices": 0}, "slices is 0, expected a number of 1 or more"),
+        ({"frame": 3}, "frame is 3, expected a text"),
+    ],
+)
+def test_broken_file_is_named(tmp_path: Path, text: str | dict[str, object], sentence: str) -> None:
+    path = tmp_path / "scale.yaml"
+    path.write_text(text if isinstance(text, str) else yaml.safe_dump({**content(), **text}), encoding="utf-8")
+    with pytest.raises(CalibrationFileError, match=sentence) as caught:
+        load_calibration(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_truncated_anywhere_is_refused_or_whole(tmp_path: Path) -> None:
+    path = tmp_path / "scale.yaml"
+    save_calibration(path, RECORD)
+    raw = path.read_bytes()
+    for size in range(len(raw) - 1):
+        path.write_bytes(raw[:size])
+        try:
+            record = load_calibration(path)
+        except CalibrationFileError:
+            continue
+        assert record is not None
+        # Only the last entry, which nothing depends on, can be cut without being noticed.
+        assert replace(record, software=RECORD.software) == RECORD
+
+
+def test_folder_in_its_place(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationFileError, match="cannot be read"):
+        load_calibration(tmp_path)
