@@ -13,6 +13,7 @@ from typing import Literal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -88,7 +89,8 @@ class RegisterNode(Node):
         self._slice_pose_input = self.create_subscription(PoseStamped, "slice_pose", self._on_slice_pose, _QUEUE)
         self._image_input = self.create_subscription(Image, "image", self._on_image, _QUEUE)
         self.create_subscription(PointStamped, "target", self._on_target, _QUEUE)
-        self.create_service(Trigger, "~/recalibrate", self._on_recalibrate)
+        # A call goes on over many turns of the executor, and must keep neither slices nor other calls from theirs.
+        self.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=ReentrantCallbackGroup())
         self.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
         self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.add_on_set_parameters_callback(self._check_parameters)

@@ -1,0 +1,130 @@
+"""`~/recalibrate` over DDS: from a wrong spacing, while slices stream in, and over a restart."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_process import RosClient, node_process
+from std_srvs.srv import Trigger
+from test_register_node import SCALE, Bench, assert_near, image_of, rendered
+
+SLICES = [rendered(seed, noise_hu=5.0) for seed in range(40, 46)]
+
+
+def arguments(namespace: str, spacing: tuple[float, float], *more: str) -> list[str]:
+    told = ["-p", f"pixel_spacing:=[{spacing[0]},{spacing[1]}]"]
+    return ["--ros-args", "-r", f"__ns:={namespace}", *told, *[part for one in more for part in ("-p", one)]]
+
+
+@pytest.fixture
+def client():
+    with RosClient("console") as console:
+        yield console
+
+
+@pytest.mark.parametrize("factors", [(1.08, 0.94), (0.9, 1.1)])
+def test_from_a_wrong_spacing(client, factors):
+    """No slice is accepted before, all are after; the last refused ones are what it is measured from."""
+    wrong = (factors[0] * SCALE.sx, factors[1] * SCALE.sy)
+    namespace = f"/wrong{int(100 * factors[0])}"
+    with node_process("register_node", *arguments(namespace, wrong)):
+        bench = Bench(client, namespace, f"{namespace}/image")
+        bench.warm_up(bench.diagnostics)
+        for hu, _ in SLICES:
+            bench.status(bench.send(image_of(hu)))
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0)
+        assert response.success, response.message
+        (measured,) = client.get_parameters(bench.node, "pixel_spacing")
+        np.testing.assert_allclose(measured, [SCALE.sx, SCALE.sy], rtol=3e-3)
+        for hu, slice_from_frame in SLICES:
+            pose, values = bench.accept(image_of(hu))
+            assert_near(pose, slice_from_frame)
+            assert values["calibration"] == "measured"
+
+
+def test_slices_are_registered_meanwhile_and_a_second_call_is_refused(client):
+    """Clutter alone keeps it searching: that takes seconds, and is waited for by nobody else."""
+    rng = np.random.default_rng(1)
+    hu, slice_from_frame = SLICES[0]
+    with node_process("register_node", *arguments("/busy", (SCALE.sx, SCALE.sy), "calibration_timeout:=20.0")):
+        bench = Bench(client, "/busy", "/busy/image")
+        bench.warm_up()
+        assert bench.set(pixel_spacing=[1.001 * SCALE.sx, SCALE.sy]) == ""  # forgets the slices of before
+        clutter = np.zeros_like(hu)
+        for u, v in rng.integers(5, 250, (14, 2)):
+            clutter[v - 1 : v + 2, u - 1 : u + 2] = 3000
+        bench.status(bench.send(image_of(clutter)))
+        service = client.node.create_client(Trigger, f"{bench.node}/recalibrate")
+        client.wait_for(service.service_is_ready, "the service")
+        first = service.call_async(Trigger.Request())
+        second = client.call(Trigger, f"{bench.node}/recalibrate")
+        assert not second.success
+        assert "running already" in second.message
+        assert "running" in client.call(Trigger, f"{bench.node}/reset_calibration").message
+        assert not first.done()
+        assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
+        for other, _ in SLICES[1:4]:
+            bench.accept(image_of(other))
+        # What has come meanwhile is enough.
+        client.wait_for(first.done, "the answer", deadline_s=60.0)
+        assert first.result().success, first.result().message
+        client.node.destroy_client(service)
+
+
+def test_the_measured_spacing_outlives_the_node(client, tmp_path: Path):
+    path = tmp_path / "scale.yaml"
+    configured = (1.01 * SCALE.sx, 0.99 * SCALE.sy)
+    told = arguments("/kept", configured, f"calibration_file:={path}")
+    with node_process("register_node", *told) as process:
+        bench = Bench(client, "/kept", "/kept/image")
+        bench.warm_up(bench.diagnostics)
+        for hu, _ in SLICES:
+            bench.status(bench.send(image_of(hu)))
+        response = client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0)
+        assert response.success, response.message
+        (measured,) = client.get_parameters(bench.node, "pixel_spacing")
+        process.stop(signal.SIGKILL)
+    with node_process("register_node", *told) as process:
+        bench = Bench(client, "/kept", "/kept/image")
+        bench.warm_up(bench.diagnostics)
+        assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == list(measured)
+        assert bench.accept(image_of(SLICES[0][0]))[1]["calibration"] == "measured"
+        assert client.call(Trigger, f"{bench.node}/reset_calibration").success
+        assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == list(configured)
+        assert not path.exists()
+
+
+@pytest.mark.parametrize("content", ["kind: something else\n", "not: [yaml", ""])
+def test_a_broken_file_is_refused_and_the_configured_spacing_used(client, tmp_path: Path, content: str):
+    path = tmp_path / "scale.yaml"
+    path.write_text(content)
+    told = arguments("/broken", (SCALE.sx, SCALE.sy), f"calibration_file:={path}")
+    with node_process("register_node", *told) as process:
+        bench = Bench(client, "/broken", "/broken/image")
+        bench.warm_up()
+        hu, slice_from_frame = SLICES[0]
+        pose, values = bench.accept(image_of(hu))
+        assert_near(pose, slice_from_frame)
+        assert values["calibration"] == "configured"
+        assert f"calibration_file is not used, the configured pixel_spacing is: {path}" in process.output
+    assert path.read_text() == content
+
+
+def test_a_file_of_another_spacing_is_refused(client, tmp_path: Path):
+    path = tmp_path / "scale.yaml"
+    with node_process("register_node", *arguments("/one", (SCALE.sx, SCALE.sy), f"calibration_file:={path}")):
+        bench = Bench(client, "/one", "/one/image")
+        bench.warm_up(bench.diagnostics)
+        for hu, _ in SLICES[:3]:
+            bench.status(bench.send(image_of(hu)))
+        assert client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0).success
+    other = arguments("/other", (1.3 * SCALE.sx, SCALE.sy), f"calibration_file:={path}")
+    with node_process("register_node", *other) as process:
+        bench = Bench(client, "/other", "/other/image")
+        bench.warm_up(bench.diagnostics)
+        (spacing,) = client.get_parameters(bench.node, "pixel_spacing")
+        assert list(spacing) == [1.3 * SCALE.sx, SCALE.sy]
+        assert "was measured in place of the pixel_spacing" in process.output
