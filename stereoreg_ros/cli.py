@@ -13,19 +13,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final, NoReturn, TextIO
+from typing import Any, Final, NoReturn, TextIO, TypeVar
 
 import cv2
 import numpy as np
 from tqdm import tqdm
 
+from stereoreg_ros.calibration import Calibration
+from stereoreg_ros.calibration_series import SeriesScale, scale_of_series
 from stereoreg_ros.dicom import DicomError, read_series, read_slice
 from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 from stereoreg_ros.registration import register_slice
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration, diagnostics
 
@@ -47,6 +49,9 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(WRONG_CALL, f"{self.prog}: {message}\n")
+
+
+_Options = TypeVar("_Options", RegistrationOptions, CalibrationOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +102,7 @@ def _parser() -> _Parser:
     parser.add_argument("--version", action="version", version=f"stereoreg {_version()}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_register(commands)
+    _add_calibrate(commands)
     _add_reproduce(commands)
     return parser
 
@@ -156,13 +162,20 @@ def _add_register(commands: argparse._SubParsersAction[_Parser]) -> None:
     scale.add_argument(
         "--pixel-shear", metavar="N", type=float, default=0.0, help="shear of the pixel grid, mm/pixel (default: 0)"
     )
-    _add_registration_options(register.add_argument_group("registration"))
+    _add_options(register.add_argument_group("registration"), RegistrationOptions)
     register.set_defaults(command=_register)
 
 
-def _add_registration_options(group: argparse._ArgumentGroup) -> None:
-    """An option for every field of RegistrationOptions."""
-    for entry in fields(RegistrationOptions):
+def _add_options(group: argparse._ArgumentGroup, options: type[RegistrationOptions | CalibrationOptions]) -> None:
+    """A command-line option for every field."""
+    for entry in fields(options):
+        if isinstance(entry.default, bool):
+            group.add_argument(
+                f"--{entry.name.replace('_', '-')}",
+                action="store_true",
+                help=entry.metadata["description"].replace("%", "%%"),
+            )
+            continue
         default: Any = entry.default
         several = isinstance(default, tuple)
         kind = type(default[0] if several else default)
@@ -188,13 +201,16 @@ def _number_or(word: str) -> Callable[[str], float | str]:
     return read
 
 
+def _given(options: type[_Options], arguments: argparse.Namespace) -> _Options:
+    """The options as given on the command line; ValueError where one is out of its range."""
+    return options(**{entry.name: getattr(arguments, entry.name) for entry in fields(options)})
+
+
 def _register(arguments: argparse.Namespace) -> int:
     """`stereoreg register`."""
     try:
         frame = load_frame(arguments.frame)
-        options = RegistrationOptions(
-            **{entry.name: getattr(arguments, entry.name) for entry in fields(RegistrationOptions)}
-        )
+        options = _given(RegistrationOptions, arguments)
         # A scale for nothing but the check, where the spacing is the file's.
         sx, sy = arguments.pixel_spacing or (1.0, 1.0)
         own_scale = PixelScale(sx, sy, arguments.pixel_shear)
@@ -325,6 +341,104 @@ def _summary(outcomes: Counter[str]) -> str:
     if outcomes["bad_image"]:
         summary += f", {outcomes['bad_image']} not readable"
     return summary
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> None:
+    calibrate = commands.add_parser(
+        "calibrate",
+        help="measure the pixel spacing from DICOM slices that show a frame",
+        description="Measures the pixel spacing from all slices together, with a pose for each, and from each slice "
+        "alone, beside what the files say.",
+        allow_abbrev=False,
+    )
+    calibrate.add_argument("paths", metavar="PATH", nargs="+", type=Path, help="DICOM file, or folder with one series")
+    calibrate.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
+    calibrate.add_argument("--json", action="store_true", help="print one JSON object")
+    calibrate.add_argument("--plot", metavar="FILE", type=Path, help="write a picture of the scale slice by slice, PNG")
+    _add_options(calibrate.add_argument_group("calibration"), CalibrationOptions)
+    _add_options(calibrate.add_argument_group("registration"), RegistrationOptions)
+    calibrate.set_defaults(command=_calibrate)
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    """`stereoreg calibrate`."""
+    try:
+        frame = load_frame(arguments.frame)
+        options, calibration = _given(RegistrationOptions, arguments), _given(CalibrationOptions, arguments)
+    except (FrameFileError, ValueError) as error:
+        raise WrongCallError(str(error)) from None
+    unreadable = 0
+
+    def readable() -> Iterator[tuple[str, Slice]]:
+        nonlocal unreadable
+        for path, ct_slice in _slices(arguments.paths):
+            if isinstance(ct_slice, DicomError):
+                unreadable += 1
+                _complain(str(ct_slice))
+            else:
+                yield path.name, ct_slice
+
+    with tqdm(total=1.0, desc="scales tried", leave=False, disable=not sys.stderr.isatty(), file=sys.stderr) as bar:
+        try:
+            series = scale_of_series(
+                readable(), frame, options, calibration, lambda share: bar.update(max(share - bar.n, 0.0))
+            )
+        except ValueError as error:
+            _complain(str(error))
+            return BAD_FILE
+    if arguments.plot is not None:
+        try:
+            # Only here: nothing else in the package needs matplotlib.
+            from stereoreg_ros.calibration_plot import draw_series_scale
+        except ModuleNotFoundError:
+            raise WrongCallError(
+                "--plot draws with matplotlib, which is not installed; it is python3-matplotlib in Ubuntu"
+            ) from None
+        draw_series_scale(series, arguments.plot)
+    if arguments.json:
+        _print(json.dumps(_series_record(series), allow_nan=False))
+    else:
+        _print_series(series)
+    return BAD_FILE if unreadable else OK
+
+
+def _series_record(series: SeriesScale) -> dict[str, Any]:
+    """The JSON object of a series; null for what was not found."""
+    outcome = series.outcome
+    found = outcome if isinstance(outcome, Calibration) else None
+    return {
+        "outcome": "accepted" if found else "refused",
+        "message": outcome.message,
+        "given_pixel_spacing": [series.given.sx, series.given.sy],
+        "pixel_spacing": [found.scale.sx, found.scale.sy] if found else None,
+        "pixel_shear": found.scale.shear if found else None,
+        "standard_errors": list(found.standard_errors) if found else None,
+        "residual_before_px": found.residual_before_px if found else None,
+        "residual_after_px": found.residual_after_px if found else None,
+        "slices": [
+            {
+                "file": one.name,
+                "rods": one.rods,
+                "linear": [one.linear.sx, one.linear.sy],
+                "newton_raphson": [one.newton_raphson.sx, one.newton_raphson.sy],
+                "standard_errors": list(one.standard_errors),
+            }
+            for one in series.slices
+        ],
+    }
+
+
+def _print_series(series: SeriesScale) -> None:
+    given = series.given
+    _print(f"{'slice':{_NAME_WIDTH}}  rods  linear sx, sy     Newton-Raphson sx, sy               beside the files' /%")
+    for one in series.slices:
+        found, (error_x, error_y) = one.newton_raphson, one.standard_errors
+        _print(
+            f"{one.name[-_NAME_WIDTH:]:{_NAME_WIDTH}}  {one.rods:4d}  {one.linear.sx:.4f}, {one.linear.sy:.4f}    "
+            f"{found.sx:.4f} +- {error_x:.4f}, {found.sy:.4f} +- {error_y:.4f}    "
+            f"{100 * (found.sx / given.sx - 1):+.2f}, {100 * (found.sy / given.sy - 1):+.2f}"
+        )
+    _print(series.outcome.message)
 
 
 def _add_reproduce(commands: argparse._SubParsersAction[_Parser]) -> None:

@@ -25,7 +25,7 @@ from stereoreg_ros.geometry.pose import Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Refusal
-from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, render_slice
+from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 
 SCALE = PixelScale(0.4, 0.45)
 SLICE_FROM_FRAME = Pose(rotation_exp(np.array([0.12, -0.08, 0.3])), np.array([42.0, 48.0, 3.0]))
@@ -355,3 +355,73 @@ def test_catphan_series(stereoreg):
     assert len(found) == 64
     assert "RT Structure Set" in errors or not list(CATPHAN.glob("RS*"))
     assert sum(one["outcome"] == "accepted" for one in found) >= 6
+
+
+@pytest.fixture(scope="session")
+def off_series(tmp_path_factory):
+    """Four slices of the cube, whose files say 2 % more and 1 % less."""
+    folder = tmp_path_factory.mktemp("series")
+    frame, rng = load_frame("cube6"), np.random.default_rng(5)
+    settings = ScannerSettings(shape=(220, 230), scale=SCALE, body=False)
+    for number in range(4):
+        placed = PlacedFrame(frame, random_pose(rng, frame, settings))
+        hu = render_slice([placed], settings, rng).hu
+        stored = (hu + 1024).astype(np.uint16)
+        write_slice(folder / f"{number}.dcm", stored, z=float(number), PixelSpacing=[0.99 * SCALE.sy, 1.02 * SCALE.sx])
+    return folder
+
+
+class TestCalibrate:
+    """The pixel spacing of a series whose files say one that is off."""
+
+    def test_table_and_plot(self, stereoreg, off_series, tmp_path):
+        plot = tmp_path / "scale.png"
+        code, output, _ = stereoreg("calibrate", "--frame", "cube6", "--plot", plot, off_series)
+        assert code == 0
+        lines = output.splitlines()
+        assert len(lines) == 1 + 4 + 1
+        assert lines[-1].startswith("pixel spacing changed from (0.4080, 0.4455) to (0.")
+        assert "from 4 slices with 24 rods" in lines[-1]
+        assert cv2.imread(str(plot)) is not None
+
+    def test_json(self, stereoreg, off_series):
+        code, output, _ = stereoreg("calibrate", "--frame", "cube6", "--json", off_series)
+        assert code == 0
+        record = json.loads(output)
+        assert record["outcome"] == "accepted"
+        assert record["given_pixel_spacing"] == pytest.approx([0.408, 0.4455])
+        for found, true, error in zip(
+            record["pixel_spacing"], (SCALE.sx, SCALE.sy), record["standard_errors"], strict=True
+        ):
+            assert abs(found - true) < 4 * error
+        assert [one["rods"] for one in record["slices"]] == [6] * 4
+        for one in record["slices"]:
+            assert one["newton_raphson"] == pytest.approx([SCALE.sx, SCALE.sy], rel=0.01)
+            assert one["linear"] == pytest.approx([SCALE.sx, SCALE.sy], rel=0.01)
+
+    def test_refused(self, stereoreg, off_series):
+        code, output, _ = stereoreg(
+            "calibrate", "--frame", "cube6", "--calibration-max-change", 0.015, "--json", off_series
+        )
+        assert code == 0
+        record = json.loads(output)
+        assert record["outcome"] == "refused"
+        assert record["pixel_spacing"] is None
+        assert record["slices"] == []
+        assert record["message"].startswith("calibration refused: ")
+
+    def test_wrong_calls(self, stereoreg, off_series, tmp_path):
+        assert (
+            "calibration_max_change is 0.9"
+            in stereoreg("calibrate", "--frame", "cube6", "--calibration-max-change", "0.9", off_series)[2]
+        )
+        code, _, errors = stereoreg("calibrate", "--frame", "cube6", tmp_path / "nothing")
+        assert code == 1
+        assert "nothing" in errors
+
+    def test_spacings_that_differ(self, stereoreg, off_series, tmp_path):
+        other = tmp_path / "other.dcm"
+        write_slice(other, np.zeros((64, 64), np.uint16), PixelSpacing=[0.7, 0.7])
+        code, _, errors = stereoreg("calibrate", "--frame", "cube6", off_series, other)
+        assert code == 1
+        assert "other.dcm: pixel spacing is (0.7, 0.7) mm/pixel, expected that of the slices before" in errors
