@@ -237,4 +237,4 @@ def test_with_register_node_on_a_real_slice(client):
             client.wait_for(lambda: statuses, "the diagnostics of the slice")
     values = {one.key: one.value for one in statuses[0].status[0].values}
     assert float(values["pixel_spacing_x_mm"]) == float(values["pixel_spacing_y_mm"]) == 0.625
-    assert values["reason"] == "ambiguous"
+    assert values["reason"] == "ambiguous", statuses[0].status[0].message

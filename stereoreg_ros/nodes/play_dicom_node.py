@@ -20,7 +20,6 @@ from stereoreg_ros.nodes.parameters import Entry, ParameterError, declare
 from stereoreg_ros.nodes.spinning import run
 from stereoreg_ros.nodes.tell_spacing import SpacingTeller
 
-_DISCOVERY_S: Final = 0.5
 POSE_GRACE_S: Final = 5.0
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02
@@ -103,11 +102,9 @@ class PlayDicomNode(Node):
             return False
         if self._image_subscribed_s is None:
             self._image_subscribed_s = now_s
-        # Of one subscriber's two subscriptions the second may be discovered later, and each of them may have discovered
-        # us later than we it: the first pose would be lost.
+        # Of one subscriber's two subscriptions the second may be discovered later, and the first pose be lost.
         waited_s = now_s - self._image_subscribed_s
-        both = self._pose_publisher.get_subscription_count() > 0 and waited_s >= _DISCOVERY_S
-        return both or waited_s >= POSE_GRACE_S
+        return self._pose_publisher.get_subscription_count() > 0 or waited_s >= POSE_GRACE_S
 
     def _play_next(self) -> None:
         path = self._series.headers[self._next].path

@@ -13,7 +13,8 @@ from sensor_msgs.msg import Image
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.nodes.conversions import MessageError
 
-WAIT_S: Final = 2.0
+# A message that is lost on its way is sent again after three seconds, the heartbeat of a reliable writer.
+WAIT_S: Final = 4.0
 _CAPACITY: Final = 32
 _Stamp: TypeAlias = tuple[int, int]
 
