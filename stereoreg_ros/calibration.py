@@ -180,11 +180,14 @@ def _matched(
     sightings: Sequence[Sighting], frame: Frame, scale: PixelScale, options: RegistrationOptions
 ) -> list[tuple[Sighting, Registration]]:
     """The slices that are accepted with this scale."""
-    results = ((one, _match(one, frame, scale, options)) for one in sightings)
+    results = ((one, match_sighting(one, frame, scale, options)) for one in sightings)
     return [(one, result) for one, result in results if result]
 
 
-def _match(sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions) -> Registration | Refusal:
+def match_sighting(
+    sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
+) -> Registration | Refusal:
+    """Register the frame from the spots of a slice with this scale, mm/pixel."""
     area_mm2 = sighting.pixels * scale.sx * scale.sy if sighting.pixels else None
     plane, covariances = sighting.scanner_from_slice, sighting.covariances_px2
     return register_spots(sighting.spots_px, frame, scale, options, plane, area_mm2, covariances_px2=covariances)
@@ -236,11 +239,11 @@ def _search(
         if progress is not None:
             progress(number / len(factors))
         for sighting in list(waiting):
-            seen = _match(sighting, frame, replace(scale, sx=by_x * scale.sx, sy=by_y * scale.sy), loose)
+            seen = match_sighting(sighting, frame, replace(scale, sx=by_x * scale.sx, sy=by_y * scale.sy), loose)
             if not seen or len(seen.matches) < MIN_LINES or _degenerate(frame, [seen]):
                 continue
             measured = _joint(frame, [seen], with_shear=False).scale
-            if _match(sighting, frame, measured, strict):
+            if match_sighting(sighting, frame, measured, strict):
                 waiting = [one for one in waiting if one is not sighting]
                 yield measured
         if not waiting:

@@ -7,11 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoreg_ros.calibration import MIN_LINES, Calibration, CalibrationRefusal, Sighting, calibrate, sighting_of
+from stereoreg_ros.calibration import (
+    MIN_LINES,
+    Calibration,
+    CalibrationRefusal,
+    Sighting,
+    calibrate,
+    match_sighting,
+    sighting_of,
+)
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
-from stereoreg_ros.registration import register_slice, register_spots
+from stereoreg_ros.registration import register_slice
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import calibrate_linear, calibrate_newton_raphson, calibration_covariance
 
@@ -75,16 +83,7 @@ def scale_of_series(
 def _alone(
     name: str, sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
 ) -> SliceScale | None:
-    area_mm2 = sighting.pixels * scale.sx * scale.sy if sighting.pixels else None
-    result = register_spots(
-        sighting.spots_px,
-        frame,
-        scale,
-        options,
-        sighting.scanner_from_slice,
-        area_mm2,
-        covariances_px2=sighting.covariances_px2,
-    )
+    result = match_sighting(sighting, frame, scale, options)
     if not result or len(result.matches) < MIN_LINES:
         return None
     lines = np.array([match.line_index for match in result.matches])

@@ -28,7 +28,8 @@ class Recalibration:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="recalibration")
         self._attempt: Future[Calibration | CalibrationRefusal] | None = None
         self._refusal = CalibrationRefusal("no slice has been accepted yet, nothing to calibrate from")
-        self._tried: tuple[int, ...] = ()
+        # Held, so that a later slice cannot be mistaken for one of these.
+        self._tried: tuple[Sighting, ...] = ()
 
     def poll(self, sightings: Sequence[Sighting], now_s: float) -> Calibration | CalibrationRefusal | None:
         """The outcome, or None where it is not there yet. sightings: the last slices; now_s: monotonic time."""
@@ -39,11 +40,11 @@ class Recalibration:
             if isinstance(outcome, Calibration):
                 return outcome
             self._refusal = outcome
-        at_hand = tuple(id(one) for one in sightings)
+        at_hand = tuple(sightings)
         if at_hand and at_hand != self._tried:
             self._tried = at_hand
             self._attempt = self._pool.submit(
-                calibrate, tuple(sightings), self.frame, self.scale, self._options, self._calibration
+                calibrate, at_hand, self.frame, self.scale, self._options, self._calibration
             )
             return None
         return self._refusal if now_s >= self._deadline_s else None

@@ -286,7 +286,6 @@ class RegisterNode(Node):
         fault = self._set_scale(outcome.scale, "measured")
         if fault:
             return False, f"the measured scale cannot be set: {fault}"
-        self._configured_scale = configured
         if not self._settings.calibration_file:
             return True, outcome.message
         path = Path(self._settings.calibration_file)
@@ -387,10 +386,9 @@ class RegisterNode(Node):
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         names = {parameter.name for parameter in parameters}
-        if "calibration_slices" in names:
-            most = changed_settings(self, []).calibration.calibration_slices
-            self._sightings = deque(self._sightings, maxlen=most)
         scale_before, self._settings = self._settings.scale, changed_settings(self, [])
+        if "calibration_slices" in names:
+            self._sightings = deque(self._sightings, maxlen=self._settings.calibration.calibration_slices)
         if "frame_file" in names:
             self._frame, self._frame_fault = self._checked_frame, ""
             self._forget_slices()

@@ -20,7 +20,7 @@ _OUTLINE: Final = 1 / 3
 # Median absolute deviation of a normal variable, of its standard deviation.
 _MAD_OF_NORMAL: Final = 0.6745
 # A region that ends above this share of its height is cut short by its threshold.
-_HALF: Final = 0.6
+_CUT_SHORT: Final = 0.6
 # In pixels around a region: how far its spot may reach, and the ring of its surroundings.
 _REACH, _RING_INNER, _RING_OUTER = 2, 3, 5
 # Patches are square, of one of these sides, so that spots of about one size are centred at once.
@@ -36,7 +36,7 @@ class FoundSpots:
 
     centres_px: (n, 2), pixel (u, v); covariances_px2: (n, 2, 2) of the centres, by the image's noise; extents_px2:
     (n, 2, 2), second moments of what is above a third of the spot's height: its size and its elongation. cut_short:
-    (n,), whether the region ends above half of that height, so that the spot may be larger than was seen.
+    (n,), whether the region ends above 0.6 of that height, so that the spot may be larger than was seen.
     """
 
     centres_px: Array
@@ -99,7 +99,7 @@ def _measured(hu: NDArray[np.float32], regions: Regions, side: int) -> FoundSpot
     clipped &= clipped.sum(axis=(1, 2), keepdims=True) >= 3
     found, covariance = centres_of_symmetry(value, centre, extent, shut & ~own, clipped, noise)
     lowest = np.where(own, value, np.inf).min(axis=(1, 2))
-    return FoundSpots(corner + found, covariance, extent, lowest > _HALF * height)
+    return FoundSpots(corner + found, covariance, extent, lowest > _CUT_SHORT * height)
 
 
 def _dilated(masks: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
