@@ -101,12 +101,12 @@ def calibrate(
     scale: PixelScale,
     options: RegistrationOptions | None = None,
     calibration: CalibrationOptions | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], bool] | None = None,
 ) -> Calibration | CalibrationRefusal:
     """One pixel scale from slices that show the frame, by joint maximum likelihood with a pose for each.
 
     scale: the configured one, mm/pixel; where it leaves slices unexplained, scales up to `calibration_max_change` off
-    are tried. progress: told the share of these that was.
+    are tried. progress: told the share of these that was, says whether to go on; where not, the calibration is refused.
     """
     options, calibration = options or RegistrationOptions(), calibration or CalibrationOptions()
     if not sightings:
@@ -120,6 +120,11 @@ def calibrate(
     if isinstance(found, str) or len(found.matched) < _EXPLAINED * len(enough):
         # A slice may be accepted with a scale that is off, one of its rods left out: what explains more is sought.
         for start in _search(_left_out(enough, found), frame, scale, options, calibration, progress):
+            if start is None:
+                return CalibrationRefusal(
+                    f"calibration refused: the search for a pixel spacing that explains {len(enough)} slices was given "
+                    "up, it took too long; fewer false spots or a nominal_orientation make it shorter"
+                )
             other = _explained(enough, frame, start, options, calibration)
             if isinstance(found, str) or (not isinstance(other, str) and other.rods > found.rods):
                 found = other
@@ -214,9 +219,9 @@ def _search(
     scale: PixelScale,
     options: RegistrationOptions,
     calibration: CalibrationOptions,
-    progress: Callable[[float], None] | None,
-) -> Iterator[PixelScale]:
-    """Scales with which one of the slices is accepted, at most one for each slice.
+    progress: Callable[[float], bool] | None,
+) -> Iterator[PixelScale | None]:
+    """Scales with which one of the slices is accepted, at most one for each slice; None where it is given up.
 
     With a scale that is a little off, a slice is recognised at a noise that allows for that; the scale is then measured
     from it, and the slice must be accepted with it at the noise that is stated, as rarely by chance as all scales tried
@@ -225,10 +230,9 @@ def _search(
     waiting = list(sightings[-_SEARCHED:])
     factors = _factors(calibration.calibration_max_change)
     ends = np.concatenate([frame.starts, frame.ends])
-    radius_px = float(np.linalg.norm(np.ptp(ends, axis=0))) / 2 / math.sqrt(scale.sx * scale.sy)
+    off_mm = _OFF * float(np.linalg.norm(np.ptp(ends, axis=0))) / 2
     loose = replace(
         options,
-        spot_noise_px=min(max(options.spot_noise_px, _OFF * radius_px), 10.0),
         max_log10_false_alarms=max(_LOOK_CLOSER, options.max_log10_false_alarms),
         max_position_std_mm=1000.0,
         min_inliers=max(MIN_LINES, options.min_inliers),
@@ -236,10 +240,14 @@ def _search(
     tried = len(factors) * max(len(waiting), 1)
     strict = replace(options, max_log10_false_alarms=options.max_log10_false_alarms - math.log10(tried))
     for number, (by_x, by_y) in enumerate(factors):
-        if progress is not None:
-            progress(number / len(factors))
+        start = replace(scale, sx=by_x * scale.sx, sy=by_y * scale.sy)
+        # The same in mm for all scales, as the matcher keeps a table for each noise.
+        noise_px = min(max(options.spot_noise_px, off_mm / max(start.sx, start.sy)), 10.0)
+        loose = replace(loose, spot_noise_px=noise_px)
         for sighting in list(waiting):
-            seen = match_sighting(sighting, frame, replace(scale, sx=by_x * scale.sx, sy=by_y * scale.sy), loose)
+            if progress is not None and not progress(number / len(factors)):
+                yield None
+            seen = match_sighting(sighting, frame, start, loose)
             if not seen or len(seen.matches) < MIN_LINES or _degenerate(frame, [seen]):
                 continue
             measured = _joint(frame, [seen], with_shear=False).scale

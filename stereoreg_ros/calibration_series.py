@@ -56,7 +56,7 @@ def scale_of_series(
     frame: Frame,
     options: RegistrationOptions,
     calibration: CalibrationOptions,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], bool] | None = None,
 ) -> SeriesScale:
     """Measure the scale from named slices of one spacing; ValueError where they have several, or there is none."""
     named: list[tuple[str, Sighting]] = []

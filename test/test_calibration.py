@@ -192,12 +192,31 @@ class TestRefused:
         rng = np.random.default_rng(14)
         taken = [seen(rng.uniform(0, 500, (9, 2))) for _ in range(2)]
         told: list[float] = []
-        refusal = calibrate(taken, cube, TRUE, OPTIONS, progress=told.append)
+
+        def tell(share: float) -> bool:
+            told.append(share)
+            return True
+
+        refusal = calibrate(taken, cube, TRUE, OPTIONS, progress=tell)
         assert isinstance(refusal, CalibrationRefusal)
         assert "in none of 2 slices the rods could be identified" in refusal.message
         assert told == sorted(told)
         assert told[0] == 0.0
         assert told[-1] < 1.0
+
+    def test_the_search_can_be_given_up(self, cube: Frame) -> None:
+        rng = np.random.default_rng(14)
+        taken = [*sightings(rng, cube, 1), *(seen(rng.uniform(0, 500, (9, 2))) for _ in range(2))]
+        told: list[float] = []
+
+        def ten_times(share: float) -> bool:
+            told.append(share)
+            return len(told) < 10
+
+        refusal = calibrate(taken, cube, TRUE, OPTIONS, progress=ten_times)
+        assert isinstance(refusal, CalibrationRefusal)
+        assert "given up" in refusal.message
+        assert len(told) == 10
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ def test_every_option_has_its_flag(stereoreg, cube_slice, monkeypatch):
         given.append(options)
         return Refusal(frame, ct_slice.scale, np.empty((0, 2)), "no_consensus", "not tried")
 
-    monkeypatch.setattr(cli, "register_slice", register_slice)
+    monkeypatch.setattr("stereoreg_ros.cli.register.register_slice", register_slice)
     wanted = RegistrationOptions(
         threshold=-1.5e3,
         min_spot_area_mm2=1.0,

@@ -19,6 +19,14 @@ def arguments(namespace: str, spacing: tuple[float, float], *more: str) -> list[
     return ["--ros-args", "-r", f"__ns:={namespace}", *told, *[part for one in more for part in ("-p", one)]]
 
 
+def clutter_of(rng: np.random.Generator) -> np.ndarray:
+    """A slice of false spots."""
+    hu = np.zeros_like(SLICES[0][0])
+    for u, v in rng.integers(5, 250, (14, 2)):
+        hu[v - 1 : v + 2, u - 1 : u + 2] = 3000
+    return hu
+
+
 @pytest.fixture
 def client():
     with RosClient("console") as console:
@@ -35,7 +43,7 @@ def test_from_a_wrong_spacing(client, factors):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES:
             bench.status(bench.send(image_of(hu)))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0)
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
         assert response.success, response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
         np.testing.assert_allclose(measured, [SCALE.sx, SCALE.sy], rtol=3e-3)
@@ -53,10 +61,7 @@ def test_slices_are_registered_meanwhile_and_a_second_call_is_refused(client):
         bench = Bench(client, "/busy", "/busy/image")
         bench.warm_up()
         assert bench.set(pixel_spacing=[1.001 * SCALE.sx, SCALE.sy]) == ""  # forgets the slices of before
-        clutter = np.zeros_like(hu)
-        for u, v in rng.integers(5, 250, (14, 2)):
-            clutter[v - 1 : v + 2, u - 1 : u + 2] = 3000
-        bench.status(bench.send(image_of(clutter)))
+        bench.status(bench.send(image_of(clutter_of(rng))))
         service = client.node.create_client(Trigger, f"{bench.node}/recalibrate")
         client.wait_for(service.service_is_ready, "the service")
         first = service.call_async(Trigger.Request())
@@ -74,6 +79,24 @@ def test_slices_are_registered_meanwhile_and_a_second_call_is_refused(client):
         client.node.destroy_client(service)
 
 
+def test_a_search_does_not_keep_the_node_from_ending(client):
+    rng = np.random.default_rng(2)
+    with node_process("register_node", *arguments("/ends", (SCALE.sx, SCALE.sy))) as process:
+        bench = Bench(client, "/ends", "/ends/image")
+        bench.warm_up()
+        assert bench.set(pixel_spacing=[1.001 * SCALE.sx, SCALE.sy]) == ""  # forgets the slices of before
+        bench.status(bench.send(image_of(clutter_of(rng))))
+        service = client.node.create_client(Trigger, f"{bench.node}/recalibrate")
+        client.wait_for(service.service_is_ready, "the service")
+        first = service.call_async(Trigger.Request())
+        assert "running" in client.call(Trigger, f"{bench.node}/reset_calibration").message
+        assert not first.done()
+        code, seconds = process.stop(signal.SIGTERM)
+        assert code == 0
+        assert seconds < 3.0, process.output
+        client.node.destroy_client(service)
+
+
 def test_the_measured_spacing_outlives_the_node(client, tmp_path: Path):
     path = tmp_path / "scale.yaml"
     configured = (1.01 * SCALE.sx, 0.99 * SCALE.sy)
@@ -83,7 +106,7 @@ def test_the_measured_spacing_outlives_the_node(client, tmp_path: Path):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES:
             bench.status(bench.send(image_of(hu)))
-        response = client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0)
+        response = client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
         assert response.success, response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
         process.stop(signal.SIGKILL)
@@ -120,7 +143,7 @@ def test_a_file_of_another_spacing_is_refused(client, tmp_path: Path):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES[:3]:
             bench.status(bench.send(image_of(hu)))
-        assert client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0).success
+        assert client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None).success
     other = arguments("/other", (1.3 * SCALE.sx, SCALE.sy), f"calibration_file:={path}")
     with node_process("register_node", *other) as process:
         bench = Bench(client, "/other", "/other/image")

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Generator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from typing import Final
 
 from stereoreg_ros.calibration import Calibration, CalibrationRefusal, Sighting, calibrate
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
+
+# Longest search for the scale, seconds; without it slices full of false spots would be searched for minutes.
+SEARCH_S: Final = 60.0
 
 
 class Recalibration:
@@ -25,7 +31,7 @@ class Recalibration:
         """deadline_s: monotonic time until which slices are waited for."""
         self.frame, self.scale = frame, scale
         self._options, self._calibration, self._deadline_s = options, calibration, deadline_s
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="recalibration")
+        self._closed = False
         self._attempt: Future[Calibration | CalibrationRefusal] | None = None
         self._refusal = CalibrationRefusal("no slice has been accepted yet, nothing to calibrate from")
         # Held, so that a later slice cannot be mistaken for one of these.
@@ -43,15 +49,28 @@ class Recalibration:
         at_hand = tuple(sightings)
         if at_hand and at_hand != self._tried:
             self._tried = at_hand
-            self._attempt = self._pool.submit(
-                calibrate, at_hand, self.frame, self.scale, self._options, self._calibration
-            )
+            self._attempt = Future()
+            # A daemon, so that the node's end does not wait for it.
+            threading.Thread(target=self._measure, args=(at_hand, self._attempt), daemon=True).start()
             return None
         return self._refusal if now_s >= self._deadline_s else None
 
     def close(self) -> None:
-        """End the thread when its work is done; nobody waits for it."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """Have a measurement that goes on end early; nobody waits for it."""
+        self._closed = True
+
+    def _measure(self, sightings: Sequence[Sighting], attempt: Future[Calibration | CalibrationRefusal]) -> None:
+        give_up_s = time.monotonic() + SEARCH_S
+
+        def go_on(_share: float) -> bool:
+            return not self._closed and time.monotonic() < give_up_s
+
+        try:
+            attempt.set_result(
+                calibrate(sightings, self.frame, self.scale, self._options, self._calibration, progress=go_on)
+            )
+        except Exception as error:  # handed to whoever polls
+            attempt.set_exception(error)
 
 
 class NextTurn:

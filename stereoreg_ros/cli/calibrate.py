@@ -1,0 +1,118 @@
+"""`stereoreg calibrate`: the pixel spacing from DICOM slices."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from stereoreg_ros.calibration import Calibration
+from stereoreg_ros.calibration_series import SeriesScale, scale_of_series
+from stereoreg_ros.cli.output import NAME_WIDTH, complain, print_line, progress_bar
+from stereoreg_ros.cli.parsing import BAD_FILE, OK, Commands, WrongCallError, add_options, given
+from stereoreg_ros.cli.series import slices_of
+from stereoreg_ros.dicom import DicomError
+from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
+from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
+
+
+def add_to(commands: Commands) -> None:
+    """Make the command known."""
+    calibrate = commands.add_parser(
+        "calibrate",
+        help="measure the pixel spacing from DICOM slices that show a frame",
+        description="Measures the pixel spacing from all slices together, with a pose for each, and from each slice "
+        "alone, beside what the files say.",
+        allow_abbrev=False,
+    )
+    calibrate.add_argument("paths", metavar="PATH", nargs="+", type=Path, help="DICOM file, or folder with one series")
+    calibrate.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
+    calibrate.add_argument("--json", action="store_true", help="print one JSON object")
+    calibrate.add_argument("--plot", metavar="FILE", type=Path, help="write a picture of the scale slice by slice, PNG")
+    add_options(calibrate.add_argument_group("calibration"), CalibrationOptions)
+    add_options(calibrate.add_argument_group("registration"), RegistrationOptions)
+    calibrate.set_defaults(command=_calibrate)
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    """`stereoreg calibrate`."""
+    try:
+        frame = load_frame(arguments.frame)
+        options, calibration = given(RegistrationOptions, arguments), given(CalibrationOptions, arguments)
+    except (FrameFileError, ValueError) as error:
+        raise WrongCallError(str(error)) from None
+    unreadable = 0
+
+    def readable() -> Iterator[tuple[str, Slice]]:
+        nonlocal unreadable
+        for path, ct_slice in slices_of(arguments.paths):
+            if isinstance(ct_slice, DicomError):
+                unreadable += 1
+                complain(str(ct_slice))
+            else:
+                yield path.name, ct_slice
+
+    with progress_bar("scales tried") as tell:
+        try:
+            series = scale_of_series(readable(), frame, options, calibration, tell)
+        except ValueError as error:
+            complain(str(error))
+            return BAD_FILE
+    if arguments.plot is not None:
+        try:
+            # Only here: nothing else in the package needs matplotlib.
+            from stereoreg_ros.calibration_plot import draw_series_scale
+        except ModuleNotFoundError:
+            raise WrongCallError(
+                "--plot draws with matplotlib, which is not installed; it is python3-matplotlib in Ubuntu"
+            ) from None
+        draw_series_scale(series, arguments.plot)
+    if arguments.json:
+        print_line(json.dumps(_series_record(series), allow_nan=False))
+    else:
+        _print_series(series)
+    return BAD_FILE if unreadable else OK
+
+
+def _series_record(series: SeriesScale) -> dict[str, Any]:
+    """The JSON object of a series; null for what was not found."""
+    outcome = series.outcome
+    found = outcome if isinstance(outcome, Calibration) else None
+    return {
+        "outcome": "accepted" if found else "refused",
+        "message": outcome.message,
+        "given_pixel_spacing": [series.given.sx, series.given.sy],
+        "pixel_spacing": [found.scale.sx, found.scale.sy] if found else None,
+        "pixel_shear": found.scale.shear if found else None,
+        "standard_errors": list(found.standard_errors) if found else None,
+        "residual_before_px": found.residual_before_px if found else None,
+        "residual_after_px": found.residual_after_px if found else None,
+        "slices": [
+            {
+                "file": one.name,
+                "rods": one.rods,
+                "linear": [one.linear.sx, one.linear.sy],
+                "newton_raphson": [one.newton_raphson.sx, one.newton_raphson.sy],
+                "standard_errors": list(one.standard_errors),
+            }
+            for one in series.slices
+        ],
+    }
+
+
+def _print_series(series: SeriesScale) -> None:
+    given = series.given
+    print_line(
+        f"{'slice':{NAME_WIDTH}}  rods  linear sx, sy     Newton-Raphson sx, sy               beside the files' /%"
+    )
+    for one in series.slices:
+        found, (error_x, error_y) = one.newton_raphson, one.standard_errors
+        print_line(
+            f"{one.name[-NAME_WIDTH:]:{NAME_WIDTH}}  {one.rods:4d}  {one.linear.sx:.4f}, {one.linear.sy:.4f}    "
+            f"{found.sx:.4f} +- {error_x:.4f}, {found.sy:.4f} +- {error_y:.4f}    "
+            f"{100 * (found.sx / given.sx - 1):+.2f}, {100 * (found.sy / given.sy - 1):+.2f}"
+        )
+    print_line(series.outcome.message)

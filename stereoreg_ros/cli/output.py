@@ -1,0 +1,42 @@
+"""Lines for the shell, beside progress bars."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final, TextIO
+
+from tqdm import tqdm
+
+NAME_WIDTH: Final = 32
+
+
+def complain(sentence: str) -> None:
+    """A sentence on standard error."""
+    _write(f"stereoreg: {sentence}", sys.stderr)
+
+
+def print_line(line: str) -> None:
+    """A line of the result."""
+    _write(line, sys.stdout)
+
+
+def _write(line: str, stream: TextIO) -> None:
+    """Write a line and draw the progress bar anew below it, if there is one."""
+    # File names need not be text, nor text that the terminal can show.
+    encoding = stream.encoding or "utf-8"
+    tqdm.write(line.encode(encoding, errors="replace").decode(encoding), file=stream)
+    stream.flush()
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[float], bool]]:
+    """A bar on standard error, shown only where somebody watches; told the share that is done, it says to go on."""
+    with tqdm(total=1.0, desc=what, leave=False, disable=not sys.stderr.isatty(), file=sys.stderr) as bar:
+
+        def tell(share: float) -> bool:
+            bar.update(max(share - bar.n, 0.0))
+            return True
+
+        yield tell
