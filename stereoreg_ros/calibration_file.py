@@ -11,10 +11,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import yaml
 
 from stereoreg_ros.calibration import Calibration
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.uncertainty import checked_scale_covariance
 
 _KIND: Final = "stereoreg_ros pixel scale"
 _MOST_BYTES: Final = 65536
@@ -30,14 +32,14 @@ class CalibrationFileError(ValueError):
 class CalibrationRecord:
     """What a calibration file says.
 
-    scale: as measured, mm/pixel; configured: the scale in place of which it was measured; standard_errors: of (sx, sy)
-    and perhaps the shear, mm/pixel; frame: name of the frame; slices, rods: from how many; date: ISO 8601; software:
-    version.
+    scale: as measured, mm/pixel; configured: the scale in place of which it was measured; covariance: (2, 2) of (sx,
+    sy) or (3, 3) with the shear, mm^2/pixel^2, row by row; frame: name of the frame; slices, rods: from how many; date:
+    ISO 8601; software: version.
     """
 
     scale: PixelScale
     configured: PixelScale
-    standard_errors: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
     frame: str
     slices: int
     rods: int
@@ -54,13 +56,18 @@ class CalibrationRecord:
         return cls(
             calibration.scale,
             configured,
-            calibration.standard_errors,
+            tuple(tuple(float(value) for value in row) for row in calibration.covariance),
             frame,
             calibration.slices,
             calibration.rods,
             datetime.now(timezone.utc).isoformat(timespec="seconds"),
             software,
         )
+
+    @property
+    def standard_errors(self) -> tuple[float, ...]:
+        """Of (sx, sy) and perhaps the shear, mm/pixel."""
+        return tuple(math.sqrt(row[k]) for k, row in enumerate(self.covariance))
 
     def replaces(self, configured: PixelScale) -> bool:
         """Whether it was measured in place of this configured scale, and not of another scanner's or zoom's."""
@@ -79,6 +86,7 @@ def save_calibration(path: Path, record: CalibrationRecord) -> None:
         "pixel_spacing": [record.scale.sx, record.scale.sy],
         "pixel_shear": record.scale.shear,
         "standard_errors": list(record.standard_errors),
+        "covariance": [list(row) for row in record.covariance],
         "configured_pixel_spacing": [record.configured.sx, record.configured.sy],
         "configured_pixel_shear": record.configured.shear,
         "frame": record.frame,
@@ -126,7 +134,7 @@ def load_calibration(path: Path) -> CalibrationRecord | None:
         found = content.get("kind") if isinstance(content, dict) else type(content).__name__
         raise CalibrationFileError(f"{path}: kind is {found!r}, expected {_KIND!r}")
     scale, old = _scale(path, content, "pixel"), _scale(path, content, "configured_pixel")
-    errors = _numbers(path, content, "standard_errors", 2, 3)
+    covariance = _covariance(path, content)
     texts = {key: content.get(key) for key in ("frame", "date", "software")}
     counts = {key: content.get(key) for key in ("slices", "rods")}
     for key, value in texts.items():
@@ -135,7 +143,7 @@ def load_calibration(path: Path) -> CalibrationRecord | None:
     for key, value in counts.items():
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise CalibrationFileError(f"{path}: {key} is {value!r}, expected a number of 1 or more")
-    return CalibrationRecord(scale, old, errors, **counts, **texts)  # type: ignore[arg-type]
+    return CalibrationRecord(scale, old, covariance, **counts, **texts)  # type: ignore[arg-type]
 
 
 def _scale(path: Path, content: dict[str, Any], which: str) -> PixelScale:
@@ -145,6 +153,30 @@ def _scale(path: Path, content: dict[str, Any], which: str) -> PixelScale:
         return PixelScale(sx, sy, shear)
     except ValueError as error:
         raise CalibrationFileError(f"{path}: {which}_spacing: {error}") from None
+
+
+def _covariance(path: Path, content: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
+    errors = _numbers(path, content, "standard_errors", 2, 3)
+    size = len(errors)
+    if "covariance" not in content:
+        # Older files have the standard errors alone. Whatever the correlations of k numbers are, their covariance is in
+        # no direction larger than k times that of independent ones.
+        variances = size * np.square(errors)
+        return tuple(tuple(float(value) for value in row) for row in np.diag(variances))
+    rows = content["covariance"]
+    if not isinstance(rows, list) or len(rows) != size:
+        raise CalibrationFileError(f"{path}: covariance is {rows!r}, expected {size} rows of {size} finite numbers")
+    covariance = tuple(_numbers(path, {"covariance": row}, "covariance", size) for row in rows)
+    try:
+        checked_scale_covariance(covariance)
+    except ValueError as error:
+        raise CalibrationFileError(f"{path}: covariance: {error}") from None
+    if not np.allclose(np.diag(covariance), np.square(errors), rtol=1e-3, atol=0.0):
+        raise CalibrationFileError(
+            f"{path}: covariance has the variances {np.diag(covariance).tolist()}, expected the squares of the "
+            f"standard_errors {list(errors)}"
+        )
+    return covariance
 
 
 def _numbers(path: Path, content: dict[str, Any], key: str, *counts: int) -> tuple[float, ...]:

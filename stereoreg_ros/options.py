@@ -11,6 +11,8 @@ from stereoreg_ros.geometry.pose import rotation_from_quaternion
 
 AUTO: Final = "auto"
 MATCHERS: Final = ("three_line", "maurin2009")
+# No point that matters is farther from the frame; one that is was told in other units.
+_FARTHEST_MM: Final = 10_000.0
 
 
 def _option(
@@ -59,6 +61,12 @@ class RegistrationOptions:
     max_position_std_mm: float = _option(
         10.0, "largest standard deviation of the frame origin's position along its worst axis, mm", 0.001, 1000.0
     )
+    target_in_frame_mm: tuple[float, float, float] = _option(
+        (0.0, 0.0, 0.0), "the point whose error counts, such as the needle's tip: x, y, z in the frame's axes, mm"
+    )
+    max_target_error_mm: float = _option(
+        1000.0, "largest radius of the ball that holds 95 % of the errors at the target, mm", 0.001, 1000.0
+    )
 
     def __post_init__(self) -> None:
         _check_ranges(self)
@@ -75,6 +83,7 @@ class RegistrationOptions:
             rotation_from_quaternion(self.nominal_orientation)
         except ValueError as error:
             raise ValueError(f"nominal_orientation: {error}") from None
+        object.__setattr__(self, "target_in_frame_mm", _checked_point("target_in_frame_mm", self.target_in_frame_mm))
         object.__setattr__(self, "min_inliers", int(self.min_inliers))
         object.__setattr__(self, "nominal_orientation", tuple(float(q) for q in self.nominal_orientation))
 
@@ -99,6 +108,18 @@ class CalibrationOptions:
         if not isinstance(self.calibrate_shear, bool):
             raise ValueError(f"calibrate_shear is {self.calibrate_shear!r}, expected true or false")
         object.__setattr__(self, "calibration_slices", int(self.calibration_slices))
+
+
+def _checked_point(name: str, value: Any) -> tuple[float, float, float]:
+    try:
+        point = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        point = np.empty(0)
+    if point.shape != (3,) or not (np.abs(point) <= _FARTHEST_MM).all():
+        raise ValueError(
+            f"{name} is {value!r}, expected three numbers of mm from {-_FARTHEST_MM:g} to {_FARTHEST_MM:g}"
+        )
+    return (float(point[0]), float(point[1]), float(point[2]))
 
 
 def _check_ranges(options: RegistrationOptions | CalibrationOptions) -> None:

@@ -26,7 +26,7 @@ from stereoreg_ros.matching.spots import Spots, Streaks
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
 from stereoreg_ros.spots import FoundSpots, find_spots
-from stereoreg_ros.uncertainty import in_scanner_axes
+from stereoreg_ros.uncertainty import checked_scale_covariance, in_scanner_axes, scale_sensitivity
 
 MAX_SPOTS = 300
 _MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
@@ -46,15 +46,20 @@ def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None
 
 
 def register_slice(
-    ct_slice: Slice, frame: Frame, options: RegistrationOptions | None = None, previous: Pose | None = None
+    ct_slice: Slice,
+    frame: Frame,
+    options: RegistrationOptions | None = None,
+    previous: Pose | None = None,
+    scale_covariance: ArrayLike | None = None,
 ) -> Registration | Refusal:
     """Register `frame` from one slice: scanner_from_frame in mm, or a refusal with its reason.
 
-    previous: see `register_spots`.
+    previous, scale_covariance: see `register_spots`.
     """
     options = options or RegistrationOptions()
+    known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
     found = find_spots(ct_slice, options)
-    return _register_found(found, ct_slice, frame, options, previous)
+    return _register_found(found, ct_slice, frame, options, previous, known)
 
 
 def register_frames(
@@ -77,7 +82,12 @@ def register_frames(
 
 
 def _register_found(
-    found: FoundSpots, ct_slice: Slice, frame: Frame, options: RegistrationOptions, previous: Pose | None = None
+    found: FoundSpots,
+    ct_slice: Slice,
+    frame: Frame,
+    options: RegistrationOptions,
+    previous: Pose | None = None,
+    scale_covariance: Array | None = None,
 ) -> Registration | Refusal:
     scale = ct_slice.scale
     area_mm2 = ct_slice.hu.size * scale.sx * scale.sy
@@ -92,6 +102,7 @@ def _register_found(
         ct_slice.scanner_from_slice,
         area_mm2,
         previous,
+        scale_covariance,
     )
 
 
@@ -104,6 +115,7 @@ def register_spots(
     slice_area_mm2: float | None = None,
     previous: Pose | None = None,
     covariances_px2: ArrayLike | None = None,
+    scale_covariance: ArrayLike | None = None,
 ) -> Registration | Refusal:
     """Register `frame` from the centres of bright spots (n, 2) in pixel (u, v), false ones among them.
 
@@ -113,8 +125,9 @@ def register_spots(
     brings less. Half of the false alarms that are allowed are for poses near the guess, half for all poses, so that a
     guess however wrong costs no certainty. The matcher `maurin2009` makes no use of it. covariances_px2: (n, 2, 2), of
     the centres, pixel^2, as their image shows them; where they are smaller than `spot_noise_px` has it, that counts, as
-    the frame is known no better.
-    Raises ValueError where the spots are not of shape (n, 2) or not finite, or their covariances are none.
+    the frame is known no better. scale_covariance: (2, 2) of (sx, sy) or (3, 3) of (sx, sy, shear), mm^2/pixel^2, where
+    the scale was measured: what it makes the pose uncertain by is added to the pose's covariance.
+    Raises ValueError where the spots are not of shape (n, 2) or not finite, or a covariance is none.
     """
     options = options or RegistrationOptions()
     scanner_from_slice = scanner_from_slice or Pose.identity()
@@ -126,8 +139,9 @@ def register_spots(
     if not np.isfinite(spots_px).all():
         raise ValueError("spots_px must be finite")
     covariances_px2 = _checked(covariances_px2, len(spots_px))
+    known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
     return _register(
-        spots_px, covariances_px2, None, frame, scale, options, scanner_from_slice, slice_area_mm2, previous
+        spots_px, covariances_px2, None, frame, scale, options, scanner_from_slice, slice_area_mm2, previous, known
     )
 
 
@@ -141,11 +155,14 @@ def _register(
     scanner_from_slice: Pose,
     slice_area_mm2: float | None,
     previous: Pose | None,
+    scale_covariance: Array | None,
 ) -> Registration | Refusal:
     """Match, judge, accept or refuse; see `register_spots`."""
 
+    asked = options
+
     def refuse(reason: Reason, message: str, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
-        return Refusal(frame, scale, spots_px, reason, message, estimates, covariances_px2)
+        return Refusal(frame, scale, spots_px, reason, message, estimates, covariances_px2, asked)
 
     count = len(spots_px)
     if count < options.min_inliers:
@@ -153,7 +170,8 @@ def _register(
     if count > MAX_SPOTS:
         return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
 
-    covariances_mm2 = scale.matrix @ at_least(covariances_px2, options.spot_noise_px) @ scale.matrix.T
+    weighted_px2 = at_least(covariances_px2, options.spot_noise_px)
+    covariances_mm2 = scale.matrix @ weighted_px2 @ scale.matrix.T
     spots = Spots.of(scale.to_mm(spots_px), covariances_mm2, slice_area_mm2, streaks)
     nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
@@ -164,7 +182,10 @@ def _register(
         found = match_near(spots, frame, prior, options, scanner_from_slice.inverse() @ previous)
     if found is None:
         found = _MATCHERS[options.matcher](spots, frame, prior, options)
-    estimates = tuple(_estimate(h, spots_px, frame, scale, scanner_from_slice) for h in found.hypotheses)
+    estimates = tuple(
+        _estimate(h, spots_px, weighted_px2, frame, scale, scanner_from_slice, scale_covariance)
+        for h in found.hypotheses
+    )
     if found.given_up:
         return refuse("no_consensus", f"the search among {count} spots was {found.given_up}", estimates)
     if not estimates:
@@ -200,6 +221,15 @@ def _register(
             "inaccurate",
             f"the position has a standard deviation of {best.position_std_mm:.2f} mm, "
             f"at most {options.max_position_std_mm:g} mm are allowed",
+            estimates,
+        )
+    target_error_mm = best.target_error_95_mm(options.target_in_frame_mm)
+    if target_error_mm > options.max_target_error_mm:
+        target = ", ".join(f"{value:g}" for value in options.target_in_frame_mm)
+        return refuse(
+            "inaccurate",
+            f"95 % of the errors at the target ({target}) mm of the frame are within {target_error_mm:.2f} mm, "
+            f"{options.max_target_error_mm:g} mm are allowed",
             estimates,
         )
     cautions = []
@@ -254,17 +284,27 @@ def _noise_mm(scale: PixelScale, noise_px: float) -> float:
 
 
 def _estimate(
-    hypothesis: Hypothesis, spots_px: Array, frame: Frame, scale: PixelScale, scanner_from_slice: Pose
+    hypothesis: Hypothesis,
+    spots_px: Array,
+    weighted_px2: Array,
+    frame: Frame,
+    scale: PixelScale,
+    scanner_from_slice: Pose,
+    scale_covariance: Array | None,
 ) -> PoseEstimate:
     slice_from_frame = Pose(hypothesis.rotation, hypothesis.translation)
     predicted_px, _ = project(frame, slice_from_frame, scale)
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
     spots = hypothesis.spot_of_line[lines]
     distances = point_line_distances(frame, lines, slice_from_frame, scale.to_mm(spots_px[spots]))
+    covariance = _covariance(hypothesis.information)
+    if scale_covariance is not None:
+        by_scale = scale_sensitivity(frame, lines, slice_from_frame, spots_px[spots], weighted_px2[spots], scale)
+        covariance = covariance + by_scale @ scale_covariance @ by_scale.T
     return PoseEstimate(
         slice_from_frame=slice_from_frame,
         scanner_from_frame=scanner_from_slice @ slice_from_frame,
-        covariance=in_scanner_axes(_covariance(hypothesis.information), scanner_from_slice),
+        covariance=in_scanner_axes(covariance, scanner_from_slice),
         matches=tuple(
             Match(frame.line_names[line], int(line), int(spot), spots_px[spot], predicted_px[line], float(distance))
             for line, spot, distance in zip(lines, spots, distances, strict=True)

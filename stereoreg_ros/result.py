@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
-from stereoreg_ros.uncertainty import error_ball_95
+from stereoreg_ros.uncertainty import error_ball_95, point_covariance
 
 Reason = Literal["too_few_spots", "no_consensus", "ambiguous", "degenerate", "inaccurate", "bad_image", "bad_frame"]
 REASONS: Final[tuple[Reason, ...]] = (
@@ -95,6 +96,11 @@ class PoseEstimate:
         """Standard deviation of the rotation about its worst axis, degrees."""
         return math.degrees(math.sqrt(max(0.0, float(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))))
 
+    def target_error_95_mm(self, target_in_frame_mm: ArrayLike) -> float:
+        """Radius in mm of the ball that holds 95 % of the errors at a point (3,) of the frame, mm."""
+        target = np.asarray(target_in_frame_mm, dtype=np.float64)
+        return error_ball_95(point_covariance(self.covariance, self.scanner_from_frame, target))
+
 
 @dataclass(frozen=True, eq=False)
 class Registration:
@@ -138,6 +144,7 @@ class Refusal:
 
     reason: one of REASONS; message: one sentence with the figures that decided; estimates: the explanations that
     were found, best first (several for `ambiguous`, none where none was found). They are for looking at, not for use.
+    options: what was to be registered with.
     """
 
     frame: Frame
@@ -147,6 +154,7 @@ class Refusal:
     message: str
     estimates: tuple[PoseEstimate, ...] = ()
     covariances_px2: Array | None = None
+    options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
     def __bool__(self) -> Literal[False]:
         return False
@@ -177,7 +185,7 @@ def diagnostics(result: Registration | Refusal, calibration: str, duration_s: fl
         "ambiguous_poses": alternatives,
         "position_std_mm": best.position_std_mm if best else nan,
         "rotation_std_deg": best.rotation_std_deg if best else nan,
-        "target_error_95_mm": error_ball_95(best.covariance[:3, :3]) if best else nan,
+        "target_error_95_mm": (best.target_error_95_mm(result.options.target_in_frame_mm) if best else nan),
         "pixel_spacing_x_mm": result.scale.sx,
         "pixel_spacing_y_mm": result.scale.sy,
         "calibration": calibration,

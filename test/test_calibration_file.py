@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -26,7 +27,7 @@ from stereoreg_ros.geometry.slice import PixelScale
 RECORD = CalibrationRecord(
     PixelScale(0.5012, 0.4987, 0.001),
     PixelScale(0.5, 0.5),
-    (0.0004, 0.0005, 0.0002),
+    ((1.6e-7, -1e-8, 1e-9), (-1e-8, 2.5e-7, 0.0), (1e-9, 0.0, 4e-8)),
     "cube6",
     10,
     60,
@@ -60,13 +61,33 @@ def test_round_trip(tmp_path: Path) -> None:
     assert load_calibration(path) is None
     save_calibration(path, RECORD)
     assert load_calibration(path) == RECORD
-    newer = replace(RECORD, scale=PixelScale(0.49, 0.51), standard_errors=(0.001, 0.001))
+    newer = replace(RECORD, scale=PixelScale(0.49, 0.51), covariance=((1e-6, 5e-7), (5e-7, 1e-6)))
     save_calibration(path, newer)
     assert load_calibration(path) == newer
     assert [entry.name for entry in tmp_path.iterdir()] == ["scale.yaml"]
     remove_calibration(path)
     remove_calibration(path)
     assert load_calibration(path) is None
+
+
+def test_standard_errors_are_roots_of_the_variances() -> None:
+    assert RECORD.standard_errors == pytest.approx((0.0004, 0.0005, 0.0002))
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_of_a_file_without_correlations_the_largest_covariance_is_taken(tmp_path: Path, size: int) -> None:
+    errors = np.array([0.001, 0.002, 0.0005])[:size]
+    old = {key: value for key, value in content().items() if key != "covariance"}
+    path = tmp_path / "scale.yaml"
+    path.write_text(yaml.safe_dump({**old, "standard_errors": errors.tolist()}), encoding="utf-8")
+    record = load_calibration(path)
+    assert record is not None
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        root = rng.normal(size=(size, int(rng.integers(1, 4))))
+        root /= np.linalg.norm(root, axis=1, keepdims=True)
+        true = np.outer(errors, errors) * (root @ root.T)
+        assert np.linalg.eigvalsh(np.array(record.covariance) - true).min() > -1e-12
 
 
 def test_belongs_to_the_scale_in_place_of_which_it_was_measured() -> None:
@@ -125,6 +146,7 @@ def content() -> dict[str, object]:
         "pixel_spacing": [0.5, 0.5],
         "pixel_shear": 0.0,
         "standard_errors": [0.001, 0.001],
+        "covariance": [[1e-6, 5e-7], [5e-7, 1e-6]],
         "configured_pixel_spacing": [0.5, 0.5],
         "configured_pixel_shear": 0.0,
         "frame": "cube6",
@@ -150,6 +172,12 @@ def content() -> dict[str, object]:
         ({"pixel_spacing": [0.5, -0.5]}, "pixel spacing sy is -0.5, expected a positive number"),
         ({"pixel_shear": "x"}, r"pixel_shear is \['x'\], expected 1 finite numbers"),
         ({"standard_errors": [True, 1]}, "standard_errors is .*, expected 2 or 3 finite numbers"),
+        ({"covariance": [[1e-6, 0.0]]}, "covariance is .*, expected 2 rows of 2 finite numbers"),
+        ({"covariance": None}, "covariance is None, expected 2 rows of 2 finite numbers"),
+        ({"covariance": [[1e-6, 0.0], [0.0]]}, r"covariance is \[0.0\], expected 2 finite numbers"),
+        ({"covariance": [[1e-6, 1e-7], [0.0, 1e-6]]}, "covariance: .*, expected a finite and symmetric matrix"),
+        ({"covariance": [[1e-6, 2e-6], [2e-6, 1e-6]]}, "covariance: .*, expected no negative variance"),
+        ({"covariance": [[1e-6, 0.0], [0.0, 4e-6]]}, "covariance has the variances .*, expected the squares of the"),
         ({"slices": 0}, "slices is 0, expected a number of 1 or more"),
         ({"frame": 3}, "frame is 3, expected a text"),
     ],

@@ -8,6 +8,7 @@ from geometry_msgs.msg import Point, PointStamped, PoseStamped, Quaternion
 from geometry_msgs.msg import Pose as PoseMessage
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
 
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
@@ -150,6 +151,43 @@ def test_covariance_in_metres_and_radians():
     assert ros[2, 5] == pytest.approx(9e-4)
     assert ros[5, 2] == pytest.approx(9e-4)
     assert ros[3, 4] == pytest.approx(0.02)
+
+
+def test_covariance_is_that_of_the_axes_and_the_order_of_ros():
+    """A pose perturbed in each of the six ways, as a receiver computes it from the message's own numbers.
+
+    REP 103 and PoseWithCovariance: x, y, z, then rotations about the fixed axes x, y, z, of the same header's frame.
+    """
+    pose = Pose(rotation_exp(np.array([0.4, -2.0, 1.1])), np.array([12.5, -700.0, 3.25]))
+    axes = np.eye(6)
+    for which in range(6):
+        deviation = np.array([0.3, 0.5, 0.7, 0.002, 0.003, 0.005])[which]
+        ros = np.reshape(conversions.covariance_to_message(deviation**2 * np.outer(axes[which], axes[which])), (6, 6))
+        (told,) = np.flatnonzero(np.diag(ros))
+        size = np.sqrt(ros[told, told])
+        moved = pose.perturbed(deviation * axes[which, :3], deviation * axes[which, 3:])
+        rest, message = conversions.pose_to_message(pose), conversions.pose_to_message(moved)
+        # Where a point of the body, metres, goes by the message's own numbers: turned about its place, then shifted.
+        body = np.array([0.05, -0.02, 0.11])
+        turn = {3: "x", 4: "y", 5: "z"}
+        by_hand = Rotation.from_quat(xyzw(rest)).apply(body)
+        if told in turn:
+            by_hand = Rotation.from_euler(turn[told], size).apply(by_hand)
+        by_hand += xyz(rest)
+        if told not in turn:
+            by_hand[told] += size
+        arrived = Rotation.from_quat(xyzw(message)).apply(body)
+        arrived += xyz(message)
+        np.testing.assert_allclose(by_hand, arrived, atol=1e-12)
+
+
+def xyz(message: PoseMessage) -> np.ndarray:
+    return np.array([message.position.x, message.position.y, message.position.z])
+
+
+def xyzw(message: PoseMessage) -> list[float]:
+    q = message.orientation
+    return [q.x, q.y, q.z, q.w]
 
 
 def test_point_there_and_back():

@@ -98,6 +98,28 @@ def test_orientation_becomes_a_tuple_that_can_be_compared_and_hashed() -> None:
     assert hash(options) == hash(RegistrationOptions(nominal_orientation=(0, 0, 1, 1)))
 
 
+@pytest.mark.parametrize(
+    "target", [(0.0, 0.0), (0.0, 0.0, np.nan), (0.0, np.inf, 0.0), (0.0, 0.0, 10001.0), "tip", None, 5.0], ids=str
+)
+def test_target_is_a_point(target: Any) -> None:
+    with pytest.raises(
+        ValueError, match=r"^target_in_frame_mm is .*, expected three numbers of mm from -10000 to 10000"
+    ):
+        RegistrationOptions(target_in_frame_mm=target)
+
+
+def test_target_becomes_a_tuple_of_plain_numbers() -> None:
+    assert RegistrationOptions().target_in_frame_mm == (0.0, 0.0, 0.0)
+    options = RegistrationOptions(target_in_frame_mm=np.array([1, -2, 3.5]))  # type: ignore[arg-type]
+    assert options.target_in_frame_mm == (1.0, -2.0, 3.5)
+    assert hash(options) == hash(RegistrationOptions(target_in_frame_mm=(1, -2, 3.5)))
+
+
+def test_no_limit_on_the_target_error_by_default() -> None:
+    (entry,) = (entry for entry in fields(RegistrationOptions) if entry.name == "max_target_error_mm")
+    assert entry.default == entry.metadata["high"]
+
+
 def test_cannot_be_changed() -> None:
     with pytest.raises(FrozenInstanceError):
         RegistrationOptions().threshold = 0.0  # type: ignore[misc]

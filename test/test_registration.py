@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
 
 from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_slice, register_spots
 from stereoreg_ros.geometry.frame import Frame
@@ -15,6 +17,7 @@ from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.registration import MAX_SPOTS
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, centred_pose, random_pose, random_spot_set
+from stereoreg_ros.uncertainty import in_scanner_axes, scale_sensitivity
 
 SCANNER = ScannerSettings()
 SCALE = SCANNER.scale
@@ -243,6 +246,22 @@ class TestRefusals:
         assert result.reason == "inaccurate"
         assert "0.01 mm" in result.message
 
+    def test_inaccurate_by_its_target_error(self, cube):
+        """The same slice is good enough for a needle that is short, and not for one that is long."""
+        truth = random_pose(np.random.default_rng(13), cube, SCANNER)
+        spots, _ = project(cube, truth, SCALE)
+        near = register_spots(spots, cube, SCALE, RegistrationOptions(max_target_error_mm=1.5))
+        assert near
+        told = RegistrationOptions(max_target_error_mm=1.5, target_in_frame_mm=(0.0, 30.0, -300.0))
+        far = register_spots(spots, cube, SCALE, told)
+        assert not far
+        assert far.reason == "inaccurate"
+        assert far.options is told
+        error = far.estimates[0].target_error_95_mm(told.target_in_frame_mm)
+        assert error > 1.5 > near.estimate.target_error_95_mm((0.0, 0.0, 0.0))
+        assert f"(0, 30, -300) mm of the frame are within {error:.2f} mm, 1.5 mm are allowed" in far.message
+        assert register_spots(spots, cube, SCALE, replace(told, max_target_error_mm=error + 1e-6))
+
     def test_what_may_be_two_millimetres_or_three_degrees_off_bears_a_caution(self):
         """Four standard deviations are the measure; upright rods leave the tilt open at some poses, not at all."""
         frame = load_frame("leksell_ct")
@@ -295,3 +314,82 @@ def test_empty_slice_is_refused(cube):
     result = register_slice(Slice(np.full((64, 64), -1000.0, dtype=np.float32), SCALE), cube)
     assert not result
     assert result.reason == "too_few_spots"
+
+
+class TestPlausibility:
+    """The stated noise is judged by the residual: its chi-square, both ways."""
+
+    @staticmethod
+    def outcomes(cube: Frame, told_px: float, trials: int = 150) -> list[str]:
+        rng = np.random.default_rng(21)
+        outcomes: list[str] = []
+        for _ in range(trials):
+            problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.2, gaussian=True))
+            result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=told_px))
+            if not result:
+                outcomes.append("implausible" if "cannot come from" in result.message else result.reason)
+            else:
+                outcomes.append("doubtful" if "is large for" in result.caution else "plain")
+        return outcomes
+
+    def test_the_right_noise_is_believed(self, cube):
+        assert set(self.outcomes(cube, 0.2)) == {"plain"}
+
+    def test_a_noise_told_too_large_is_no_reason_to_doubt(self, cube):
+        assert set(self.outcomes(cube, 0.4)) == {"plain"}
+
+    def test_a_noise_told_too_small_is_doubted_or_refused(self, cube):
+        """Chi-square of 6 degrees of freedom is four times as large: above 22.5 one in two is doubtful, few are not."""
+        found = self.outcomes(cube, 0.1)
+        assert found.count("doubtful") > 20
+        assert found.count("implausible") > 5
+        assert "plain" in found
+
+    def test_chi_square_is_that_of_its_degrees_of_freedom(self, cube):
+        rng = np.random.default_rng(22)
+        values = []
+        for _ in range(300):
+            problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.2, gaussian=True))
+            result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=0.2))
+            assert result
+            assert result.estimate.degrees_of_freedom == 6
+            values.append(result.estimate.chi_square)
+        assert kstest(values, chi2(6).cdf).pvalue > 0.001
+
+
+class TestScaleCovariance:
+    def test_adds_what_the_scale_makes_uncertain(self, cube):
+        truth = random_pose(np.random.default_rng(23), cube, SCANNER)
+        plane = Pose(Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix(), np.array([5.0, 6.0, 7.0]))
+        spots, _ = project(cube, truth, SCALE)
+        covariance = 1e-6 * np.array([[1.0, 0.3, 0.1], [0.3, 2.0, 0.0], [0.1, 0.0, 0.5]])
+        plain = register_spots(spots, cube, SCALE, scanner_from_slice=plane)
+        wide = register_spots(spots, cube, SCALE, scanner_from_slice=plane, scale_covariance=covariance)
+        assert plain
+        assert wide
+        lines = np.array([match.line_index for match in wide.matches])
+        seen = np.array([match.spot_px for match in wide.matches])
+        noise = np.tile(0.09 * np.eye(2), (len(lines), 1, 1))
+        by_scale = scale_sensitivity(cube, lines, wide.estimate.slice_from_frame, seen, noise, SCALE)
+        added = in_scanner_axes(by_scale @ covariance @ by_scale.T, plane)
+        assert wide.estimate.position_std_mm > 1.2 * plain.estimate.position_std_mm
+        np.testing.assert_allclose(wide.covariance, plain.covariance + added, atol=1e-12)
+        nothing = register_spots(spots, cube, SCALE, scanner_from_slice=plane, scale_covariance=np.zeros((2, 2)))
+        assert nothing
+        np.testing.assert_allclose(nothing.covariance, plain.covariance, atol=1e-15)
+
+    def test_counts_in_what_is_refused(self, cube):
+        truth = random_pose(np.random.default_rng(24), cube, SCANNER)
+        spots, _ = project(cube, truth, SCALE)
+        options = RegistrationOptions(max_position_std_mm=1.0)
+        assert register_spots(spots, cube, SCALE, options)
+        result = register_spots(spots, cube, SCALE, options, scale_covariance=0.01**2 * np.eye(2))
+        assert not result
+        assert result.reason == "inaccurate"
+
+    @pytest.mark.parametrize("given", [np.eye(4), [[1.0, 2.0], [0.0, 1.0]], [[-1.0, 0.0], [0.0, 1.0]]], ids=str)
+    def test_what_is_none_is_named(self, cube, given):
+        with pytest.raises(ValueError, match="scale_covariance"):
+            register_spots(np.zeros((6, 2)), cube, SCALE, scale_covariance=given)
+        with pytest.raises(ValueError, match="scale_covariance"):
+            register_slice(Slice(np.zeros((32, 32), np.float32), SCALE), cube, scale_covariance=given)

@@ -100,6 +100,14 @@ class TestDiagnostics:
         assert told["calibration"] == "measured"
         assert told["duration_ms"] == pytest.approx(12.5)
 
+    def test_target_error_is_that_of_the_target_told(self, accepted: Registration) -> None:
+        """100 mm along x the rotations about y and z add 0.02 and 0.001 rad times 100 mm across."""
+        told = replace(accepted, options=RegistrationOptions(target_in_frame_mm=(100.0, 0.0, 0.0)))
+        expected = error_ball_95(np.diag([0.01, 0.04 + 0.01, 0.09 + 4.0]))
+        assert diagnostics(told, "configured", 0.1)["target_error_95_mm"] == pytest.approx(expected)
+        failed = replace(refused((estimate(),)), options=told.options)
+        assert diagnostics(failed, "configured", 0.1)["target_error_95_mm"] == pytest.approx(expected)
+
     def test_what_a_refusal_does_not_have_is_nan(self) -> None:
         told = diagnostics(refused(), "configured", 0.1)
         assert (told["outcome"], told["reason"]) == ("refused", "no_consensus")

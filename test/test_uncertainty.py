@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from frames import random_frame, random_slice_from_frame
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
-from stereoreg_ros.uncertainty import error_ball_95, in_scanner_axes, point_covariance
+from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, rotation_exp
+from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers.maximum_likelihood import refine
+from stereoreg_ros.uncertainty import (
+    checked_scale_covariance,
+    error_ball_95,
+    in_scanner_axes,
+    point_covariance,
+    scale_sensitivity,
+)
 
 
 def random_covariance(rng: np.random.Generator, position: float, rotation: float) -> Array:
@@ -107,3 +120,95 @@ class TestScannerAxes:
         np.testing.assert_allclose(turned[:3, 3:], r @ covariance[:3, 3:] @ r.T, atol=1e-12)
         np.testing.assert_allclose(in_scanner_axes(turned, pose.inverse()), covariance, atol=1e-12)
         np.testing.assert_allclose(in_scanner_axes(covariance, Pose.identity()), covariance)
+
+
+def exact_probability(radius: float, variances: Array) -> float:
+    """That a Gaussian error of the given variances lies within the radius, by integration over its directions."""
+    nodes, weights = np.polynomial.legendre.leggauss(120)
+    height, height_weights = 0.5 * (nodes + 1), 0.5 * weights
+    turn, turn_weights = np.pi / 4 * (nodes + 1), 0.5 * weights
+    # In axes in which the error is round, a direction's length is chi distributed with three degrees of freedom.
+    first, second, third = np.sort(variances)[::-1]
+    across = second * np.cos(turn) ** 2 + third * np.sin(turn) ** 2
+    along = first * height[:, None] ** 2 + (1 - height[:, None] ** 2) * across
+    return float(height_weights @ chi2.cdf(radius**2 / along, 3) @ turn_weights)
+
+
+def test_the_ball_is_within_0_3_percent_of_exact_over_every_covariance() -> None:
+    held = [
+        exact_probability(
+            error_ball_95(np.diag([1.0, second, second * third])), np.array([1.0, second, second * third])
+        )
+        for second in (1e-3, 0.01, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.85, 1.0)
+        for third in (1e-3, 0.03, 0.1, 0.25, 0.5, 0.75, 1.0)
+    ]
+    print(f"the ball holds {100 * min(held):.2f} to {100 * max(held):.2f} %")
+    assert min(held) > 0.9499
+    assert max(held) < 0.953
+
+
+class TestScaleSensitivity:
+    @pytest.mark.parametrize("shear", [0.0, 0.02])
+    def test_is_how_the_maximum_likelihood_pose_follows_the_scale(self, shear: float) -> None:
+        rng = np.random.default_rng(6)
+        frame = random_frame(rng, 7)
+        lines = np.array([0, 2, 3, 4, 6])
+        truth = random_slice_from_frame(rng, frame)
+        scale = PixelScale(0.45, 0.6, shear)
+        spots = project(frame, truth, scale)[0][lines] + rng.normal(0, 0.02, (5, 2))
+        root = rng.normal(size=(5, 2, 2))
+        covariances = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(2)
+
+        def pose_at(changed: PixelScale, start: Pose) -> Pose:
+            # The weights stay those of the told scale: that they follow it matters only where there are residuals.
+            spots_mm, used = np.zeros((1, 7, 2)), np.zeros((1, 7), dtype=bool)
+            whitening = np.tile(np.eye(2), (1, 7, 1, 1))
+            spots_mm[0, lines], used[0, lines] = changed.to_mm(spots), True
+            whitening[0, lines] = np.linalg.inv(np.linalg.cholesky(scale.matrix @ covariances @ scale.matrix.T))
+            found = refine(frame, start.rotation[None], start.translation[None], spots_mm, used, whitening, 100)
+            return Pose(nearest_rotation(found.rotations[0]), found.translations[0])
+
+        rest = pose_at(scale, truth)
+        stated = scale_sensitivity(frame, lines, rest, spots, covariances, scale)
+        step = 1e-4
+        for column, name in enumerate(("sx", "sy", "shear")):
+            more = pose_at(replace(scale, **{name: getattr(scale, name) + step}), rest)
+            less = pose_at(replace(scale, **{name: getattr(scale, name) - step}), rest)
+            turn = Rotation.from_matrix(more.rotation @ less.rotation.T).as_rotvec()
+            moved = np.concatenate([more.translation - less.translation, turn]) / (2 * step)
+            size = np.array([np.abs(stated[:3]).max()] * 3 + [np.abs(stated[3:]).max()] * 3)
+            np.testing.assert_allclose(moved / size, stated[:, column] / size, atol=5e-3, err_msg=name)
+
+    def test_a_shift_by_the_spacing_is_a_shift_of_the_pose(self) -> None:
+        """All spots in one place but for the frame's size: far from the pixels' origin, a scale is a shift."""
+        rng = np.random.default_rng(7)
+        frame = random_frame(rng, 6)
+        pose = Pose(np.eye(3), np.array([1e5, 0.0, 0.0]))
+        scale = PixelScale(0.5, 0.5)
+        spots = project(frame, pose, scale)[0]
+        stated = scale_sensitivity(frame, np.arange(6), pose, spots, np.tile(np.eye(2), (6, 1, 1)), scale)
+        assert stated[0, 0] == pytest.approx(2e5, rel=0.01)
+
+
+class TestScaleCovariance:
+    def test_two_numbers_say_nothing_of_the_shear(self) -> None:
+        whole = checked_scale_covariance([[4.0, 1.0], [1.0, 9.0]])
+        np.testing.assert_array_equal(whole, [[4, 1, 0], [1, 9, 0], [0, 0, 0]])
+        np.testing.assert_array_equal(checked_scale_covariance(np.diag([1.0, 2.0, 3.0])), np.diag([1.0, 2.0, 3.0]))
+
+    @pytest.mark.parametrize(
+        ("given", "sentence"),
+        [
+            ([1.0, 2.0], r"scale_covariance has shape \(2,\), expected \(2, 2\) or \(3, 3\)"),
+            (np.eye(4), r"scale_covariance has shape \(4, 4\)"),
+            ([[1.0, np.nan], [np.nan, 1.0]], "scale_covariance is .*, expected a finite and symmetric matrix"),
+            ([[1.0, np.inf], [np.inf, 1.0]], "expected a finite and symmetric matrix"),
+            ([[1.0, 0.5], [0.4, 1.0]], "expected a finite and symmetric matrix"),
+            ([[1.0, 2.0], [2.0, 1.0]], "expected no negative variance"),
+            (np.diag([1e-8, -1e-9]), "expected no negative variance"),
+        ],
+        ids=str,
+    )
+    def test_what_is_none_is_named(self, given: object, sentence: str) -> None:
+        with pytest.raises(ValueError, match=sentence):
+            checked_scale_covariance(given)  # type: ignore[arg-type]

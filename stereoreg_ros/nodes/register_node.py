@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
@@ -71,6 +72,8 @@ class RegisterNode(Node):
         self._checked_frame = self._frame
         self._configured_scale = self._settings.scale
         self._calibration: Literal["configured", "measured"] = "configured"
+        # Of the measured scale; a configured one is taken to be exact.
+        self._scale_covariance: Array | None = None
         self._changes_scale_itself = False
         self._slice_poses = SlicePoses()
         self._slice_pose_seen = False
@@ -139,7 +142,7 @@ class RegisterNode(Node):
         try:
             ct_slice = self._slice_from(image, scanner_from_slice)
             previous = self._latest.registration.scanner_from_frame if self._latest else None
-            result = register_slice(ct_slice, self._frame, self._settings.options, previous)
+            result = register_slice(ct_slice, self._frame, self._settings.options, previous, self._scale_covariance)
             duration_s = time.perf_counter() - started
             status = status_of(result, self._calibration, duration_s, header.frame_id)
         except ValueError as error:
@@ -283,7 +286,7 @@ class RegisterNode(Node):
         if not outcome:
             return False, outcome.message
         configured = self._configured_scale or recalibration.scale
-        fault = self._set_scale(outcome.scale, "measured")
+        fault = self._set_scale(outcome.scale, "measured", outcome.covariance)
         if fault:
             return False, f"the measured scale cannot be set: {fault}"
         if not self._settings.calibration_file:
@@ -340,7 +343,7 @@ class RegisterNode(Node):
                 f"[{record.configured.sx:.6g}, {record.configured.sy:.6g}], which is {told}"
             )
             return
-        fault = self._set_scale(record.scale, "measured")
+        fault = self._set_scale(record.scale, "measured", np.array(record.covariance))
         if fault:
             self.get_logger().warning(f"calibration_file is not used: {path}: {fault}")
             return
@@ -348,7 +351,9 @@ class RegisterNode(Node):
             f"pixel_spacing [{record.scale.sx:.6g}, {record.scale.sy:.6g}] as measured on {record.date}, from {path}"
         )
 
-    def _set_scale(self, scale: PixelScale, calibration: Literal["configured", "measured"]) -> str:
+    def _set_scale(
+        self, scale: PixelScale, calibration: Literal["configured", "measured"], covariance: Array | None = None
+    ) -> str:
         """Change the scale's parameters as one; returns why they cannot be, or nothing."""
         self._changes_scale_itself = True
         try:
@@ -361,7 +366,7 @@ class RegisterNode(Node):
         finally:
             self._changes_scale_itself = False
         if outcome.successful:
-            self._calibration = calibration
+            self._calibration, self._scale_covariance = calibration, covariance
         return str(outcome.reason)
 
     # Parameters.
@@ -394,6 +399,7 @@ class RegisterNode(Node):
             self._forget_slices()
         if names & {"pixel_spacing", "pixel_shear"} and not self._changes_scale_itself:
             self._configured_scale, self._calibration = self._settings.scale, "configured"
+            self._scale_covariance = None
             if self._settings.scale != scale_before:
                 self._forget_slices()
 
