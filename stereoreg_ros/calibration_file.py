@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -17,6 +15,7 @@ import yaml
 from stereoreg_ros.calibration import Calibration
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.uncertainty import checked_scale_covariance
+from stereoreg_ros.whole_file import sync_folder, write_whole
 
 _KIND: Final = "stereoreg_ros pixel scale"
 _MOST_BYTES: Final = 65536
@@ -96,23 +95,13 @@ def save_calibration(path: Path, record: CalibrationRecord) -> None:
         "software": record.software,
     }
     text = yaml.safe_dump(content, sort_keys=False)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
+    write_whole(path, text)
 
 
 def remove_calibration(path: Path) -> None:
     """Remove the file, if there is one, for good. Raises OSError where that fails."""
     path.unlink(missing_ok=True)
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 def load_calibration(path: Path) -> CalibrationRecord | None:
@@ -188,12 +177,3 @@ def _numbers(path: Path, content: dict[str, Any], key: str, *counts: int) -> tup
         expected = " or ".join(str(count) for count in counts)
         raise CalibrationFileError(f"{path}: {key} is {values!r}, expected {expected} finite numbers")
     return tuple(float(one) for one in values)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Have the folder's entry on the disk, not only the file."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

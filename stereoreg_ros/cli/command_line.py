@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 
-from stereoreg_ros.cli import calibrate, register, reproduce
+from stereoreg_ros.cli import calibrate, design, inspect, register, reproduce
 from stereoreg_ros.cli.output import complain
 from stereoreg_ros.cli.parsing import BAD_FILE, INTERRUPTED, WRONG_CALL, Parser, WrongCallError, shielded
 
@@ -43,6 +43,8 @@ def _parser() -> Parser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     register.add_to(commands)
     calibrate.add_to(commands)
+    inspect.add_to(commands)
+    design.add_to(commands)
     reproduce.add_to(commands)
     return parser
 

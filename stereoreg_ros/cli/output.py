@@ -30,10 +30,15 @@ def _write(line: str, stream: TextIO) -> None:
     stream.flush()
 
 
+def watched() -> bool:
+    """Whether somebody may see a progress bar."""
+    return sys.stderr.isatty()
+
+
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], bool]]:
     """A bar on standard error, shown only where somebody watches; told the share that is done, it says to go on."""
-    with tqdm(total=1.0, desc=what, leave=False, disable=not sys.stderr.isatty(), file=sys.stderr) as bar:
+    with tqdm(total=1.0, desc=what, leave=False, disable=not watched(), file=sys.stderr) as bar:
 
         def tell(share: float) -> bool:
             bar.update(max(share - bar.n, 0.0))

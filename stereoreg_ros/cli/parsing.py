@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final, NoReturn, TypeAlias, TypeVar
@@ -40,9 +40,15 @@ def shielded(argument: str) -> str:
     return f" {argument}"
 
 
-def add_options(group: argparse._ArgumentGroup, options: type[RegistrationOptions | CalibrationOptions]) -> None:
-    """A command-line option for every field."""
+def add_options(
+    group: argparse._ArgumentGroup,
+    options: type[RegistrationOptions | CalibrationOptions],
+    only: Sequence[str] | None = None,
+) -> None:
+    """A command-line option for every field, or for some."""
     for entry in fields(options):
+        if only is not None and entry.name not in only:
+            continue
         if isinstance(entry.default, bool):
             group.add_argument(
                 f"--{entry.name.replace('_', '-')}",
@@ -75,9 +81,10 @@ def _number_or(word: str) -> Callable[[str], float | str]:
     return read
 
 
-def given(options: type[_Options], arguments: argparse.Namespace) -> _Options:
+def given(options: type[_Options], arguments: argparse.Namespace, only: Sequence[str] | None = None) -> _Options:
     """The options as given on the command line; ValueError where one is out of its range."""
-    return options(**{entry.name: getattr(arguments, entry.name) for entry in fields(options)})
+    names = [entry.name for entry in fields(options)] if only is None else only
+    return options(**{name: getattr(arguments, name) for name in names})
 
 
 def make_folder(option: str, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -53,6 +54,22 @@ def load_frame(source: str | os.PathLike[str]) -> Frame:
         where = f", line {mark.line + 1}" if mark else ""
         raise FrameFileError(f"{path}{where}: is not valid YAML: {getattr(error, 'problem', error)}") from None
     return _Reader(path).frame(root)
+
+
+def frame_text(frame: Frame, comment: str) -> str:
+    """The frame as the text of a frame file, under a comment; lengths to a thousandth of a millimetre."""
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines += [f"name: {_quoted(frame.name)}", "lines:"]
+    for name, start, end, diameter in zip(frame.line_names, frame.starts, frame.ends, frame.diameters, strict=True):
+        points = [", ".join(f"{round(float(value), 3) + 0.0:g}" for value in point) for point in (start, end)]
+        lines.append(f"  - {{name: {_quoted(name)}, from: [{points[0]}], to: [{points[1]}], diameter: {diameter:g}}}")
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(name: str) -> str:
+    """As it is where YAML takes it for the same text, else in quotes."""
+    plain = name.isidentifier() and yaml.safe_load(name) == name
+    return name if plain else json.dumps(name)
 
 
 def shipped_frames() -> dict[str, Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,19 @@ from stereoreg_ros.geometry.slice import PixelScale
 
 # Below this cosine between rod and slice normal the cut runs away along the rod: treated as no cut at all.
 _MIN_COSINE = 1e-6
+
+
+class BoundedLines(Protocol):
+    """What can be cut: a `Frame`, or many at once with axes for the poses in between; see there for the arrays."""
+
+    @property
+    def directions(self) -> Array: ...
+    @property
+    def origins(self) -> Array: ...
+    @property
+    def lambda_min(self) -> Array: ...
+    @property
+    def lambda_max(self) -> Array: ...
 
 
 class Cuts(NamedTuple):
@@ -33,7 +46,7 @@ class Cuts(NamedTuple):
         return Cuts(self.points_mm[rows], self.lambdas[rows], self.inside[rows], self.directions[rows])
 
 
-def cut(frame: Frame, rotations: Array, translations: Array) -> Cuts:
+def cut(frame: BoundedLines, rotations: Array, translations: Array) -> Cuts:
     """Cut all lines of `frame` by the slice, for poses slice_from_frame (..., 3, 3), (..., 3) mm.
 
     This is eq. 28 of Maurin 2009: its least-squares form reduces to the line's intersection with the plane z = 0.
