@@ -24,7 +24,7 @@ def gap_by_search(start_a, end_a, start_b, end_b) -> float:
         return float(offset @ offset)
 
     starts = [(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0), (0.5, 0.5)]
-    return min(np.sqrt(minimize(squared, s, bounds=[(0, 1)] * 2, tol=1e-14).fun) for s in starts)
+    return min(float(np.sqrt(minimize(squared, s, bounds=[(0, 1)] * 2, tol=1e-14).fun)) for s in starts)
 
 
 @settings(deadline=None, max_examples=40)

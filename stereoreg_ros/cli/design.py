@@ -70,7 +70,7 @@ def add_to(commands: Commands) -> None:
     design.add_argument("--generations", metavar="N", type=int, default=600, help="length of the search (default: 600)")
     add_slices(design.add_argument_group("slices"))
     add_options(design.add_argument_group("registration"), RegistrationOptions, USED_OPTIONS)
-    design.set_defaults(command=_design, poses=200)
+    design.set_defaults(command=_design)
 
 
 def _design(arguments: argparse.Namespace) -> int:

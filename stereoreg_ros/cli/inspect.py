@@ -39,7 +39,6 @@ def add_to(commands: Commands) -> None:
     inspect.add_argument("--json", action="store_true", help="print one JSON object")
     inspect.add_argument("--picture", metavar="FILE", type=Path, help="write a picture of rods and errors, PNG")
     add_slices(inspect.add_argument_group("slices"))
-    inspect.add_argument("--poses", metavar="N", type=int, default=200, help="number of slices (default: 200)")
     add_options(inspect.add_argument_group("registration"), RegistrationOptions, USED_OPTIONS)
     inspect.set_defaults(command=_inspect)
 
@@ -56,6 +55,9 @@ def add_slices(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--tilt", metavar="DEG", type=float, default=30.0, help="largest tilt of a slice, degrees (default: 30)"
+    )
+    group.add_argument(
+        "--poses", metavar="N", type=int, default=200, help="number of slices the inspector looks at (default: 200)"
     )
     group.add_argument("--seed", metavar="N", type=int, default=0, help="seed of everything random (default: 0)")
 
