@@ -63,18 +63,23 @@ def register_slice(
 
 
 def register_frames(
-    ct_slice: Slice, frames: Sequence[Frame], options: RegistrationOptions | None = None
+    ct_slice: Slice,
+    frames: Sequence[Frame],
+    options: RegistrationOptions | None = None,
+    previous: Sequence[Pose | None] | None = None,
+    scale_covariance: Array | None = None,
 ) -> list[Registration | Refusal]:
     """Register several frames from one slice, one result for each, in their order.
 
     The spots are found once. Those that an accepted frame has taken are not offered to the next; to a frame, another
-    one's spots are false spots. `Match.spot` counts in the spots of that frame's own result.
+    one's spots are false spots. `Match.spot` counts in the spots of that frame's own result. previous: one a frame;
+    that and scale_covariance: see `register_spots`.
     """
     options = options or RegistrationOptions()
     found = find_spots(ct_slice, options)
     results: list[Registration | Refusal] = []
-    for frame in frames:
-        result = _register_found(found, ct_slice, frame, options)
+    for frame, before in zip(frames, previous or [None] * len(frames), strict=True):
+        result = _register_found(found, ct_slice, frame, options, before, scale_covariance)
         if result:
             found = found.take(np.delete(np.arange(len(found)), [match.spot for match in result.matches]))
         results.append(result)

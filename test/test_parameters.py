@@ -50,6 +50,8 @@ def test_descriptor(entry):
     elif isinstance(entry.default, int) and not isinstance(entry.default, bool):
         (bounds,) = descriptor.integer_range
         assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0)
+    elif isinstance(entry.default, tuple) and isinstance(entry.default[0], str):
+        assert descriptor.additional_constraints == "any number of names"
     elif isinstance(entry.default, tuple):
         assert descriptor.additional_constraints == f"{len(entry.default)} numbers"
 

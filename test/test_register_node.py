@@ -123,7 +123,7 @@ class Bench:
         assert of_stamp(self.poses, stamp) is None
 
     def call(self, service: str) -> Trigger.Response:
-        return self.client.call(Trigger, f"{self.node}/{service}")
+        return self.client.call(Trigger, f"{self.node}/{service}", again_after_s=None)
 
     def set(self, **values: Any) -> str:
         """Set parameters as one; returns why they were refused, or nothing."""
@@ -604,15 +604,15 @@ def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
     def broken(*_: object) -> None:
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr(register_node, "register_slice", broken)
+    monkeypatch.setattr(register_node, "register_frames", broken)
     published: list[DiagnosticStatus] = []
     os.environ.update(ROS_ENVIRONMENT)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = register_node.RegisterNode()
-        monkeypatch.setattr(node, "_publish_status", lambda status, _header: published.append(status))
+        monkeypatch.setattr(node, "_publish_statuses", lambda statuses, _header: published.extend(statuses))
         node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
-        node._on_image(image_of(rendered(19)[0]))
+        node._on_image(image_of(rendered(19)[0]), {"received_timestamp": time.time_ns()})
         node.destroy_node()
     finally:
         rclpy.shutdown()

@@ -19,14 +19,14 @@ def status_of(
     """Status of a slice that came to registration: OK, WARN where the result bears a caution, ERROR where refused."""
     values = diagnostics(result, calibration, duration_s)
     if not result:
-        return _status(DiagnosticStatus.ERROR, result.message, values, hardware_id)
+        return status_with(DiagnosticStatus.ERROR, NAME, result.message, values, hardware_id)
     message = (
         f"registered {len(result.matches)} of {len(result.frame)} rods, "
         f"residual {result.estimate.residual_rms_mm:.2g} mm"
     )
     if result.caution:
-        return _status(DiagnosticStatus.WARN, f"{message}; {result.caution}", values, hardware_id)
-    return _status(DiagnosticStatus.OK, message, values, hardware_id)
+        return status_with(DiagnosticStatus.WARN, NAME, f"{message}; {result.caution}", values, hardware_id)
+    return status_with(DiagnosticStatus.OK, NAME, message, values, hardware_id)
 
 
 def status_of_unusable(
@@ -63,13 +63,16 @@ def status_of_unusable(
         "calibration": calibration,
         "duration_ms": 1e3 * duration_s,
     }
-    return _status(DiagnosticStatus.ERROR, message, values, hardware_id)
+    return status_with(DiagnosticStatus.ERROR, NAME, message, values, hardware_id)
 
 
-def _status(level: bytes, message: str, values: Mapping[str, str | int | float], hardware_id: str) -> DiagnosticStatus:
+def status_with(
+    level: bytes, name: str, message: str, values: Mapping[str, str | int | float], hardware_id: str
+) -> DiagnosticStatus:
+    """A status; numbers as plain text, those that do not exist as `nan`."""
     return DiagnosticStatus(
         level=level,
-        name=NAME,
+        name=name,
         message=message,
         hardware_id=hardware_id,
         values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],

@@ -1,46 +1,98 @@
-"""What RViz shows of one slice: the rods where they were found, the spots they rest on, the slice's plane."""
+"""What RViz shows of one slice: its plane, the rods that were found, their spots, the error, the target."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import count
 from typing import Final
 
 import numpy as np
-from geometry_msgs.msg import Vector3
+from geometry_msgs.msg import PointStamped, Vector3
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import Slice
-from stereoreg_ros.nodes.conversions import MM_PER_M, point_to_message, pose_to_message
+from stereoreg_ros.nodes.conversions import MM_PER_M, point_from_message, point_to_message, pose_to_message
 from stereoreg_ros.result import Refusal, Registration
+from stereoreg_ros.uncertainty import point_covariance
 
 _MATCHED: Final = (0.2, 0.8, 0.3, 1.0)
 _MISSING: Final = (0.9, 0.3, 0.2, 1.0)
 _SPOT: Final = (1.0, 0.8, 0.1, 1.0)
 _PLANE: Final = (0.4, 0.6, 1.0, 1.0)
+_TARGET: Final = (0.9, 0.2, 0.9, 1.0)
+_ERROR: Final = (1.0, 0.6, 0.1, 0.4)
 _SPOT_DIAMETER_MM: Final = 3.0
+_TARGET_DIAMETER_MM: Final = 4.0
+_THINNEST_MM: Final = 0.01
+_CHI_SQUARE_3_AT_95: Final = 7.8147
 _PLANE_WIDTH_MM: Final = 0.5
 
 
-def markers_of(ct_slice: Slice, result: Registration | Refusal, header: Header, fiducial_frame_id: str) -> MarkerArray:
-    """Markers in scanner axes, which need no TF: rods (green: with a spot, red: without), spots and the slice's plane.
+def markers_of(
+    ct_slice: Slice,
+    results: Sequence[tuple[Registration | Refusal, str]],
+    header: Header,
+    target: PointStamped | None = None,
+) -> MarkerArray:
+    """Markers in scanner axes, which need no TF, for each frame's result and the name of its axes.
 
-    A refused slice shows its plane only. Everything shown before is removed.
+    The slice's plane; of an accepted frame its rods (green: with a spot, red: without), the spots, and the ellipsoid
+    that holds 95 % of the errors at `target_in_frame_mm`, in its true size; the target, in scanner axes. Everything
+    shown before is removed.
     """
-    numbers = count()
-    shown = [Marker(header=header, action=Marker.DELETEALL), _plane(ct_slice, header, next(numbers))]
-    if result:
-        matched = {match.line_index for match in result.matches}
-        for line in range(len(result.frame)):
-            colour = _MATCHED if line in matched else _MISSING
-            shown.append(_rod(result, line, colour, header, next(numbers)))
-        spots_px = np.array([match.spot_px for match in result.matches])
-        shown.append(_spots(_in_scanner(ct_slice, spots_px), header, next(numbers)))
-    for marker in shown:
-        marker.ns = fiducial_frame_id
+    shown = [Marker(header=header, action=Marker.DELETEALL), _named(_plane(ct_slice, header, 0), "slice")]
+    if target is not None:
+        shown.append(_named(_target(target, header), "target"))
+    for result, name in results:
+        if result:
+            shown += [_named(marker, name) for marker in _frame(ct_slice, result, header)]
     return MarkerArray(markers=shown)
+
+
+def _frame(ct_slice: Slice, result: Registration, header: Header) -> list[Marker]:
+    numbers = count()
+    matched = {match.line_index for match in result.matches}
+    rods = [
+        _rod(result, line, _MATCHED if line in matched else _MISSING, header, next(numbers))
+        for line in range(len(result.frame))
+    ]
+    spots_px = np.array([match.spot_px for match in result.matches])
+    spots = _spots(_in_scanner(ct_slice, spots_px), header, next(numbers))
+    return [*rods, spots, _ellipsoid(result, header, next(numbers))]
+
+
+def _named(marker: Marker, namespace: str) -> Marker:
+    marker.ns = namespace
+    return marker
+
+
+def _target(target: PointStamped, header: Header) -> Marker:
+    at = Pose(np.eye(3), point_from_message(target))
+    return Marker(
+        header=header,
+        type=Marker.SPHERE,
+        pose=pose_to_message(at),
+        scale=_metres(_TARGET_DIAMETER_MM, _TARGET_DIAMETER_MM, _TARGET_DIAMETER_MM),
+        color=_colour(_TARGET),
+    )
+
+
+def _ellipsoid(result: Registration, header: Header, number: int) -> Marker:
+    """Where the point `target_in_frame_mm` is, with 95 % of its errors."""
+    pose, point = result.scanner_from_frame, np.array(result.options.target_in_frame_mm)
+    variances, axes = np.linalg.eigh(point_covariance(result.covariance, pose, point))
+    axes = axes * np.sign(np.linalg.det(axes))
+    diameters = 2 * np.sqrt(_CHI_SQUARE_3_AT_95 * np.maximum(variances, 0.0))
+    return Marker(
+        header=header,
+        id=number,
+        type=Marker.SPHERE,
+        pose=pose_to_message(Pose(axes, pose @ point)),
+        scale=_metres(*np.maximum(diameters, _THINNEST_MM)),
+        color=_colour(_ERROR),
+    )
 
 
 def _rod(

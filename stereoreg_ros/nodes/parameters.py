@@ -46,7 +46,8 @@ class Entry:
             descriptor.dynamic_typing = True
             descriptor.additional_constraints = f"a number, or '{self.word}'"
         if isinstance(self.default, tuple):
-            descriptor.additional_constraints = f"{len(self.default)} numbers"
+            texts = isinstance(self.default[0], str)
+            descriptor.additional_constraints = "any number of names" if texts else f"{len(self.default)} numbers"
         elif self.low is not None and self.high is not None:
             if isinstance(self.default, int):
                 descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high))]
@@ -106,6 +107,11 @@ class NodeSettings:
     options: RegistrationOptions
     calibration: CalibrationOptions
     frame_file: str = setting("cube6", "frame file: a path, or the name of a shipped frame")
+    # rclpy cannot tell what an empty list is a list of.
+    frame_files: tuple[str, ...] = setting(
+        ("",),
+        "files of several frames, in place of frame_file; each gets topics under its name; [''] for none",
+    )
     pixel_spacing: tuple[float, float] = setting(
         (0.0, 0.0), "pixel spacing [sx, sy]: between columns, between rows, mm/pixel; [0, 0]: not told yet"
     )
@@ -114,6 +120,11 @@ class NodeSettings:
     rescale_intercept: float = setting(0.0, "HU = value * rescale_slope + rescale_intercept", -1e6, 1e6)
     scanner_frame_id: str = setting("", "frame_id of the scanner in all messages; empty: the image's frame_id")
     fiducial_frame_id: str = setting("stereotactic_frame", "name of the stereotactic frame's axes in messages")
+    publish_tf: bool = setting(False, "whether to send each pose to TF too, which needs tf2_ros")
+    max_pose_age: float = setting(
+        60.0, "oldest pose that target_in_frame may rest on, s since its slice came", 0.1, 1e6
+    )
+    stale_after: float = setting(10.0, "how long no slice may come before the stream counts as stale, s", 0.1, 1e6)
     calibration_timeout: float = setting(5.0, "how long recalibration waits for slices that it can use, s", 0.0, 600.0)
     calibration_file: str = setting(
         "", "file that keeps a measured pixel spacing over a restart; empty: it is forgotten"
@@ -150,6 +161,11 @@ class NodeSettings:
             CalibrationOptions(**of(CalibrationOptions)),
         )
         return cls(options=options, calibration=calibration, **of(cls))
+
+    @property
+    def frame_sources(self) -> tuple[str, ...]:
+        """Files or names of the frames to be registered."""
+        return tuple(source for source in self.frame_files if source) or (self.frame_file,)
 
     @property
     def scale(self) -> PixelScale | None:

@@ -1,65 +1,52 @@
-"""The node that registers a stereotactic frame from every CT slice it receives."""
+"""The node that registers stereotactic frames from every CT slice it receives."""
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 import traceback
-from collections import deque
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from collections.abc import Callable
+from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from stereoreg_ros.calibration import Sighting, sighting_of
-from stereoreg_ros.calibration_file import (
-    CalibrationFileError,
-    CalibrationRecord,
-    load_calibration,
-    remove_calibration,
-    save_calibration,
-)
+from stereoreg_ros.calibration import sighting_of
 from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
-from stereoreg_ros.geometry.pose import Array, Pose
-from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.pose import Pose
+from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.nodes import conversions
+from stereoreg_ros.nodes.backlog import Backlog, received_s, waiting_in
 from stereoreg_ros.nodes.conversions import MessageError
 from stereoreg_ros.nodes.diagnostic_status import status_of, status_of_unusable
+from stereoreg_ros.nodes.frame_output import FrameOutput, FrameTopics
 from stereoreg_ros.nodes.markers import markers_of
-from stereoreg_ros.nodes.parameters import changed_settings, declare_settings
-from stereoreg_ros.nodes.recalibration import NextTurn, Recalibration
+from stereoreg_ros.nodes.parameters import NodeSettings, ParameterError, changed_settings, declare_settings
+from stereoreg_ros.nodes.quality import QUEUE, copy_of, overridable, publisher_of, telling_subscription
+from stereoreg_ros.nodes.scale_keeper import ScaleKeeper
 from stereoreg_ros.nodes.slice_poses import WAIT_S, SlicePoses
 from stereoreg_ros.nodes.spinning import run
-from stereoreg_ros.registration import register_slice
+from stereoreg_ros.nodes.stream_status import StreamStatus
+from stereoreg_ros.nodes.targets import TargetInFrame, status_of_target, target_in_frame
+from stereoreg_ros.nodes.transforms import broadcaster_of, has_tf2
+from stereoreg_ros.registration import register_frames
 from stereoreg_ros.result import Reason, Refusal, Registration
 
-# Deep enough that no slice is lost while one is registered, and small enough not to hoard memory.
-_QUEUE = 10
 _LOOK_FOR_OVERDUE_S = 0.1
+_REPORT_STREAM_S = 1.0
 _REPEAT_WARNING_S = 5.0
-_POLL_S = 0.002
-
-
-@dataclass(frozen=True, eq=False)
-class _Accepted:
-    """The latest pose: its header and the registration it comes from."""
-
-    header: Header
-    registration: Registration
+_TOPIC_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 class RegisterNode(Node):
@@ -67,43 +54,76 @@ class RegisterNode(Node):
 
     def __init__(self) -> None:
         super().__init__("register_node")
-        self._settings = declare_settings(self)
-        self._frame, self._frame_fault = self._load_start_frame()
-        self._checked_frame = self._frame
-        self._configured_scale = self._settings.scale
-        self._calibration: Literal["configured", "measured"] = "configured"
-        # Of the measured scale; a configured one is taken to be exact.
-        self._scale_covariance: Array | None = None
-        self._changes_scale_itself = False
+        self.settings: NodeSettings = declare_settings(self)
+        if self.settings.publish_tf and not has_tf2():
+            raise ParameterError(_NO_TF2)
+        self._checked_frames: tuple[Frame, ...] = ()
+        # They are there before a frame is, so that a controller can wait for them.
+        self._topics = [FrameTopics(self)]
+        self._outputs: list[FrameOutput] = []
+        self._frame_fault = self._load_start_frames()
+        self._backlog = Backlog()
         self._slice_poses = SlicePoses()
         self._slice_pose_seen = False
         self._target: PointStamped | None = None
-        self._latest: _Accepted | None = None
-        self._sightings: deque[Sighting] = deque(maxlen=self._settings.calibration.calibration_slices)
-        self._recalibration: Recalibration | None = None
+        self._stream = StreamStatus(time.monotonic())
+        self._send_transform: Callable[[TransformStamped], None] | None = None
+        self._choose_tf()
 
-        self._pose = self.create_publisher(PoseStamped, "pose", _QUEUE)
-        self._pose_with_covariance = self.create_publisher(PoseWithCovarianceStamped, "pose_with_covariance", _QUEUE)
-        self._target_in_frame = self.create_publisher(PointStamped, "target_in_frame", _QUEUE)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _QUEUE)
-        self._overlay = self.create_publisher(Image, "overlay", _QUEUE)
-        self._markers = self.create_publisher(MarkerArray, "markers", _QUEUE)
+        self._diagnostics = publisher_of(self, DiagnosticArray, "/diagnostics", QUEUE)
+        self._overlay = publisher_of(self, Image, "overlay", QUEUE)
+        self._markers = publisher_of(self, MarkerArray, "markers", QUEUE)
         # The pose before the image: where both are there, rclpy serves them in this order and no image has to wait.
-        self._slice_pose_input = self.create_subscription(PoseStamped, "slice_pose", self._on_slice_pose, _QUEUE)
-        self._image_input = self.create_subscription(Image, "image", self._on_image, _QUEUE)
-        self.create_subscription(PointStamped, "target", self._on_target, _QUEUE)
-        # A call goes on over many turns of the executor, and must keep neither slices nor other calls from theirs.
-        self.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=ReentrantCallbackGroup())
-        self.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
-        self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._slice_pose_input = self._subscribe(PoseStamped, "slice_pose", self._on_slice_pose)
+        self._image_input = self._subscribe(Image, "image", self._on_image)
+        self._subscribe(PointStamped, "target", self._on_target)
+        self._more_wait = self.create_guard_condition(self._register_next)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=steady)
+        self.create_timer(_REPORT_STREAM_S, self._report_stream, clock=steady)
+        self._scale = ScaleKeeper(self, self)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        self._load_calibration()
-        self.get_logger().info(f"ready, frame {self._settings.frame_file}")
+        self._scale.load()
+        self.get_logger().info(f"ready, frame {', '.join(self.settings.frame_sources)}")
+
+    @property
+    def frame(self) -> Frame | None:
+        """The first frame, which the pixel scale is measured with; None where no frame could be loaded."""
+        return self._outputs[0].frame if self._outputs else None
+
+    def images_come(self) -> bool:
+        """Whether somebody publishes images."""
+        return self.count_publishers(self._image_input.topic_name) > 0
+
+    def _subscribe(self, message_type: Any, topic: str, callback: Callable[..., None]) -> Any:
+        return self.create_subscription(
+            message_type,
+            topic,
+            callback,
+            copy_of(QUEUE),
+            event_callbacks=telling_subscription(self, topic),
+            qos_overriding_options=overridable(),
+        )
 
     # From an image to a pose, in the order of the data.
 
-    def _on_image(self, image: Image) -> None:
+    def _on_image(self, image: Image, info: Any) -> None:
+        self._backlog.add(image, received_s(info))
+        self._register_next()
+
+    def _register_next(self) -> None:
+        """One slice, and then it is the turn of services, parameters and timers before the next."""
+        for image, came_s in waiting_in(self._image_input):
+            self._backlog.add(image, came_s)
+        image = self._backlog.take(time.time())
+        if image is not None:
+            self._pair(image)
+        if len(self._backlog):
+            self._more_wait.trigger()
+
+    def _pair(self, image: Image) -> None:
+        """Register an image with its slice pose, or let it wait for that."""
         if not self._slice_pose_expected():
             self._register(image, Pose.identity())
             return
@@ -134,17 +154,22 @@ class RegisterNode(Node):
 
     def _register(self, image: Image, scanner_from_slice: Pose | MessageError) -> None:
         """Register one image and publish what came of it; whatever is in the image, the node lives on."""
-        started = time.perf_counter()
-        header = Header(stamp=image.header.stamp, frame_id=self._settings.scanner_frame_id or image.header.frame_id)
-        if self._frame is None:
+        started, came_s = time.perf_counter(), time.monotonic()
+        header = Header(stamp=image.header.stamp, frame_id=self.settings.scanner_frame_id or image.header.frame_id)
+        if not self._outputs:
             self._refuse_unusable("bad_frame", self._frame_fault, header, started)
             return
         try:
             ct_slice = self._slice_from(image, scanner_from_slice)
-            previous = self._latest.registration.scanner_from_frame if self._latest else None
-            result = register_slice(ct_slice, self._frame, self._settings.options, previous, self._scale_covariance)
+            results = register_frames(
+                ct_slice,
+                [output.frame for output in self._outputs],
+                self.settings.options,
+                [output.latest.registration.scanner_from_frame if output.latest else None for output in self._outputs],
+                self._scale.covariance,
+            )
             duration_s = time.perf_counter() - started
-            status = status_of(result, self._calibration, duration_s, header.frame_id)
+            statuses = [status_of(result, self._scale.source, duration_s, header.frame_id) for result in results]
         except ValueError as error:
             self._refuse_unusable("bad_image", str(error), header, started)
             return
@@ -152,64 +177,70 @@ class RegisterNode(Node):
             self.get_logger().error(f"internal error while registering an image\n{traceback.format_exc()}")
             self._refuse_unusable("bad_image", f"internal error: {type(error).__name__}: {error}", header, started)
             return
-        if len(result.spots_px) >= self._settings.options.min_inliers:
-            self._sightings.append(sighting_of(result, ct_slice.hu.size, ct_slice.scanner_from_slice))
-        if result:
-            self._publish_pose(result, header)
-        else:
-            self._latest = None
-        self._publish_status(status, header)
-        self._publish_pictures(ct_slice, result, header)
+        if len(results[0].spots_px) >= self.settings.options.min_inliers:
+            sighting = sighting_of(results[0], ct_slice.hu.size, ct_slice.scanner_from_slice)
+            self._scale.sightings.append(sighting)
+        for output, result in zip(self._outputs, results, strict=True):
+            output.publish(result, header, came_s, self._axes_of(output.frame), self._send_transform)
+        self._publish_statuses(statuses, header)
+        self._publish_target_in_frame()
+        self._publish_pictures(ct_slice, results, header)
 
     def _slice_from(self, image: Image, scanner_from_slice: Pose | MessageError) -> Slice:
         if isinstance(scanner_from_slice, MessageError):
             raise scanner_from_slice
-        settings = self._settings
+        settings = self.settings
         if settings.scale is None:
             raise MessageError("pixel_spacing is not told yet, set the parameter to [sx, sy] in mm/pixel")
         hu = conversions.hu_from_image(image, settings.rescale_slope, settings.rescale_intercept)
         return Slice(hu, settings.scale, scanner_from_slice)
 
-    def _publish_pose(self, registration: Registration, header: Header) -> None:
-        pose = conversions.pose_to_message(registration.scanner_from_frame)
-        self._pose.publish(PoseStamped(header=header, pose=pose))
-        with_covariance = PoseWithCovarianceStamped(header=header)
-        with_covariance.pose.pose = pose
-        with_covariance.pose.covariance = conversions.covariance_to_message(registration.covariance)
-        self._pose_with_covariance.publish(with_covariance)
-        self._latest = _Accepted(header, registration)
-        self._publish_target_in_frame()
+    def _axes_of(self, frame: Frame) -> str:
+        """Name of a frame's axes in messages: the parameter's where it is alone, else its own."""
+        return self.settings.fiducial_frame_id if len(self._outputs) == 1 else frame.name
 
     def _refuse_unusable(self, reason: Reason, message: str, header: Header, started: float) -> None:
-        self._latest = None
         self.get_logger().warning(f"image refused: {message}", throttle_duration_sec=_REPEAT_WARNING_S)
-        settings, frame = self._settings, self._frame
-        status = status_of_unusable(
-            reason,
-            message,
-            frame_name=frame.name if frame else settings.frame_file,
-            lines=len(frame) if frame else 0,
-            pixel_spacing=settings.pixel_spacing,
-            calibration=self._calibration,
-            duration_s=time.perf_counter() - started,
-            hardware_id=header.frame_id,
-        )
-        self._publish_status(status, header)
+        for output in self._outputs:
+            output.latest = None
+        frames = [(output.frame.name, len(output.frame)) for output in self._outputs]
+        statuses = [
+            status_of_unusable(
+                reason,
+                message,
+                frame_name=name,
+                lines=lines,
+                pixel_spacing=self.settings.pixel_spacing,
+                calibration=self._scale.source,
+                duration_s=time.perf_counter() - started,
+                hardware_id=header.frame_id,
+            )
+            for name, lines in frames or [(source, 0) for source in self.settings.frame_sources]
+        ]
+        self._publish_statuses(statuses, header)
 
-    def _publish_status(self, status: DiagnosticStatus, header: Header) -> None:
+    def _publish_statuses(self, statuses: list[DiagnosticStatus], header: Header) -> None:
+        if len(statuses) > 1:
+            for status in statuses:
+                frame = next(pair.value for pair in status.values if pair.key == "frame")
+                status.name = f"{status.name} of {frame}"
         # The image's stamp, so that a status can be laid beside its pose.
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=header.stamp), status=[status]))
+        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=header.stamp), status=statuses))
+        stamp = Time.from_msg(header.stamp, clock_type=self.get_clock().clock_type)
+        latency_ms = (self.get_clock().now() - stamp).nanoseconds / 1e6 if stamp.nanoseconds else float("nan")
+        self._stream.registered(time.monotonic(), latency_ms)
 
-    def _publish_pictures(self, ct_slice: Slice, result: Registration | Refusal, header: Header) -> None:
+    def _publish_pictures(self, ct_slice: Slice, results: list[Registration | Refusal], header: Header) -> None:
         overlay_wanted = self._overlay.get_subscription_count() > 0
         markers_wanted = self._markers.get_subscription_count() > 0
         overlay = markers = None
         try:
             if overlay_wanted:
-                overlay = conversions.image_from_bgr(draw_overlay(ct_slice, result))
+                overlay = conversions.image_from_bgr(draw_overlay(ct_slice, results[0]))
                 overlay.header = header
             if markers_wanted:
-                markers = markers_of(ct_slice, result, header, self._settings.fiducial_frame_id)
+                named = [(result, self._axes_of(result.frame)) for result in results]
+                markers = markers_of(ct_slice, named, header, self._usable_target(header))
         except Exception:
             self.get_logger().error(f"internal error while drawing a slice\n{traceback.format_exc()}")
         if overlay is not None:
@@ -217,196 +248,135 @@ class RegisterNode(Node):
         if markers is not None:
             self._markers.publish(markers)
 
+    def _report_stream(self) -> None:
+        now_s = time.monotonic()
+        if not self._stream.due(now_s, self.settings.stale_after):
+            return
+        status = self._stream.report(
+            now_s,
+            self.settings.stale_after,
+            self._backlog.received,
+            self._backlog.skipped,
+            len(self._backlog),
+            self.settings.scanner_frame_id,
+        )
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=[status]))
+
     # The target.
 
     def _on_target(self, message: PointStamped) -> None:
         # A target that cannot be used takes the place of the one before: steering to that one would look right.
-        self._target = None
-        try:
-            conversions.point_from_message(message)
-        except MessageError as error:
-            self.get_logger().warning(f"target ignored: {error}")
-            return
         self._target = message
         self._publish_target_in_frame()
 
     def _publish_target_in_frame(self) -> None:
-        if self._target is None or self._latest is None:
+        if self._target is None:
             return
-        header, registration = self._latest.header, self._latest.registration
-        if self._target.header.frame_id != header.frame_id:
-            self.get_logger().warning(
-                f"target ignored: its frame_id is '{self._target.header.frame_id}', "
-                f"expected that of the pose, '{header.frame_id}'",
-                throttle_duration_sec=_REPEAT_WARNING_S,
+        statuses = []
+        for output in self._outputs:
+            settings = self.settings
+            outcome = target_in_frame(
+                self._target,
+                output.latest,
+                time.monotonic(),
+                settings.max_pose_age,
+                settings.options.max_target_error_mm,
             )
-            self._target = None
-            return
-        target_in_scanner: Array = conversions.point_from_message(self._target)
-        target_in_frame: Array = registration.scanner_from_frame.inverse() @ target_in_scanner
-        self._target_in_frame.publish(
-            PointStamped(
-                header=Header(stamp=header.stamp, frame_id=self._settings.fiducial_frame_id),
-                point=conversions.point_to_message(target_in_frame),
-            )
-        )
+            if isinstance(outcome, TargetInFrame):
+                output.publish_target(outcome, self._axes_of(output.frame))
+            else:
+                self.get_logger().warning(outcome.message, throttle_duration_sec=_REPEAT_WARNING_S)
+                if outcome.reason == "bad_target":
+                    self._target = None
+            statuses.append(status_of_target(outcome, output.frame.name, self._target_axes()))
+            if self._target is None:
+                break
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=statuses))
 
-    # The pixel scale.
+    def _target_axes(self) -> str:
+        return self._target.header.frame_id if self._target is not None else ""
 
-    async def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._recalibration is not None:
-            response.success, response.message = False, "a recalibration is running already, wait for its answer"
-            return response
-        settings, frame = self._settings, self._frame
-        if frame is None or settings.scale is None or not (self._sightings or self._images_come()):
-            response.success, response.message = False, "no slice has been accepted yet, nothing to calibrate from"
-            return response
-        wait_s = settings.calibration_timeout if self._images_come() else 0.0
-        self._recalibration = Recalibration(
-            frame, settings.scale, settings.options, settings.calibration, time.monotonic() + wait_s
-        )
-        try:
-            response.success, response.message = await self._recalibrate(self._recalibration)
-        except Exception as error:
-            self.get_logger().error(f"internal error in recalibrate\n{traceback.format_exc()}")
-            response.success, response.message = False, f"internal error: {type(error).__name__}: {error}"
-        finally:
-            self._recalibration.close()
-            self._recalibration = None
-        return response
-
-    async def _recalibrate(self, recalibration: Recalibration) -> tuple[bool, str]:
-        """Whether the scale was changed, and the sentence for the operator."""
-        while (outcome := recalibration.poll(self._sightings, time.monotonic())) is None:
-            # Slices have their turn meanwhile; the sleep leaves the processor to the thread that measures.
-            time.sleep(_POLL_S)
-            await NextTurn()
-        if self._frame is not recalibration.frame or self._settings.scale != recalibration.scale:
-            return False, "calibration refused: the frame or the pixel spacing was changed meanwhile"
-        if not outcome:
-            return False, outcome.message
-        configured = self._configured_scale or recalibration.scale
-        fault = self._set_scale(outcome.scale, "measured", outcome.covariance)
-        if fault:
-            return False, f"the measured scale cannot be set: {fault}"
-        if not self._settings.calibration_file:
-            return True, outcome.message
-        path = Path(self._settings.calibration_file)
-        try:
-            save_calibration(path, CalibrationRecord.of(outcome, configured, recalibration.frame.name))
-        except OSError as error:
-            self.get_logger().warning(f"calibration_file {path} cannot be written: {error}")
-            return True, f"{outcome.message}; but it will be forgotten: {path} cannot be written: {error.strerror}"
-        return True, outcome.message
-
-    def _images_come(self) -> bool:
-        return self.count_publishers(self._image_input.topic_name) > 0
-
-    def _on_reset_calibration(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._recalibration is not None:
-            response.success, response.message = False, "a recalibration is running, wait for its answer"
-            return response
-        if self._configured_scale is None:
-            response.success, response.message = False, "pixel_spacing has not been configured, nothing to go back to"
-            return response
-        if self._settings.calibration_file:
-            path = Path(self._settings.calibration_file)
-            try:
-                remove_calibration(path)
-            except OSError as error:
-                response.success = False
-                response.message = f"calibration_file {path} cannot be removed: {error.strerror}; nothing was changed"
-                return response
-        fault = self._set_scale(self._configured_scale, "configured")
-        scale = self._configured_scale
-        back = f"pixel_spacing is the configured one, [{scale.sx:.9g}, {scale.sy:.9g}] mm/pixel"
-        response.success, response.message = not fault, fault or back
-        return response
-
-    def _load_calibration(self) -> None:
-        """Take up what was measured before the restart, where that can be trusted."""
-        if not self._settings.calibration_file:
-            return
-        path = Path(self._settings.calibration_file)
-        try:
-            record = load_calibration(path)
-        except CalibrationFileError as error:
-            self.get_logger().warning(f"calibration_file is not used, the configured pixel_spacing is: {error}")
-            return
-        if record is None:
-            return
-        configured = self._settings.scale
-        if configured is None or not record.replaces(configured):
-            told = "not told" if configured is None else f"[{configured.sx:.6g}, {configured.sy:.6g}]"
-            self.get_logger().warning(
-                f"calibration_file is not used: {path} was measured in place of the pixel_spacing "
-                f"[{record.configured.sx:.6g}, {record.configured.sy:.6g}], which is {told}"
-            )
-            return
-        fault = self._set_scale(record.scale, "measured", np.array(record.covariance))
-        if fault:
-            self.get_logger().warning(f"calibration_file is not used: {path}: {fault}")
-            return
-        self.get_logger().info(
-            f"pixel_spacing [{record.scale.sx:.6g}, {record.scale.sy:.6g}] as measured on {record.date}, from {path}"
-        )
-
-    def _set_scale(
-        self, scale: PixelScale, calibration: Literal["configured", "measured"], covariance: Array | None = None
-    ) -> str:
-        """Change the scale's parameters as one; returns why they cannot be, or nothing."""
-        self._changes_scale_itself = True
-        try:
-            outcome = self.set_parameters_atomically(
-                [
-                    Parameter("pixel_spacing", value=[float(scale.sx), float(scale.sy)]),
-                    Parameter("pixel_shear", value=float(scale.shear)),
-                ]
-            )
-        finally:
-            self._changes_scale_itself = False
-        if outcome.successful:
-            self._calibration, self._scale_covariance = calibration, covariance
-        return str(outcome.reason)
+    def _usable_target(self, header: Header) -> PointStamped | None:
+        """The target, where it is in the axes of what is drawn."""
+        target = self._target
+        return target if target is not None and target.header.frame_id == header.frame_id else None
 
     # Parameters.
 
-    def _load_start_frame(self) -> tuple[Frame | None, str]:
+    def _load_start_frames(self) -> str:
+        """Load the frames; returns why they cannot be, or nothing."""
         try:
-            return load_frame(self._settings.frame_file), ""
+            self._checked_frames = _loaded(self.settings.frame_sources)
         except ValueError as error:
             self.get_logger().error(f"no slice can be registered until frame_file is set: {error}")
-            return None, str(error)
+            return str(error)
+        self._use_frames()
+        return ""
+
+    def _use_frames(self) -> None:
+        for topics in self._topics:
+            topics.destroy()
+        alone = len(self._checked_frames) == 1
+        self._topics = [FrameTopics(self, "" if alone else f"{frame.name}/") for frame in self._checked_frames]
+        self._outputs = [FrameOutput(*both) for both in zip(self._checked_frames, self._topics, strict=True)]
+
+    def _choose_tf(self) -> None:
+        if self.settings.publish_tf and self._send_transform is None:
+            self._send_transform = broadcaster_of(self)
+        if not self.settings.publish_tf:
+            self._send_transform = None
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
             settings = changed_settings(self, parameters)
-            if settings.scale is None and self._settings.scale is not None:
+            if settings.scale is None and self.settings.scale is not None:
                 raise ValueError("pixel_spacing is [0, 0], expected two positive numbers of mm/pixel")
-            if any(parameter.name == "frame_file" for parameter in parameters):
-                self._checked_frame = load_frame(settings.frame_file)
+            if settings.publish_tf and not has_tf2():
+                raise ValueError(_NO_TF2)
+            if any(parameter.name in ("frame_file", "frame_files") for parameter in parameters):
+                self._checked_frames = _loaded(settings.frame_sources)
         except Exception as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         names = {parameter.name for parameter in parameters}
-        scale_before, self._settings = self._settings.scale, changed_settings(self, [])
+        scale_before, self.settings = self.settings.scale, changed_settings(self, [])
         if "calibration_slices" in names:
-            self._sightings = deque(self._sightings, maxlen=self._settings.calibration.calibration_slices)
-        if "frame_file" in names:
-            self._frame, self._frame_fault = self._checked_frame, ""
+            self._scale.keep_slices(self.settings.calibration.calibration_slices)
+        if "publish_tf" in names:
+            self._choose_tf()
+        if names & {"frame_file", "frame_files"}:
+            self._frame_fault = ""
+            self._use_frames()
             self._forget_slices()
-        if names & {"pixel_spacing", "pixel_shear"} and not self._changes_scale_itself:
-            self._configured_scale, self._calibration = self._settings.scale, "configured"
-            self._scale_covariance = None
-            if self._settings.scale != scale_before:
-                self._forget_slices()
+        if names & {"pixel_spacing", "pixel_shear"} and self._scale.told(scale_before):
+            self._forget_slices()
 
     def _forget_slices(self) -> None:
         """A slice seen under another frame or scale says nothing about this one."""
-        self._latest = None
-        self._sightings.clear()
+        for output in self._outputs:
+            output.latest = None
+        self._scale.sightings.clear()
+
+
+_NO_TF2 = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
+
+
+def _loaded(sources: tuple[str, ...]) -> tuple[Frame, ...]:
+    """The frames; ValueError where one cannot be loaded, or several cannot have topics of their own."""
+    frames = tuple(load_frame(source) for source in sources)
+    names = [frame.name for frame in frames]
+    for name in names:
+        if len(names) > 1 and not _TOPIC_NAME.fullmatch(name):
+            raise ValueError(
+                f"frame_files: frame '{name}' cannot name a topic, expected a letter and then letters, digits and '_'"
+            )
+        if names.count(name) > 1:
+            raise ValueError(f"frame_files: two frames are called '{name}', expected distinct names")
+    return frames
 
 
 def main() -> int:
