@@ -2,7 +2,8 @@
 
 Spot sets and rendered slices with known poses are registered, and the errors compared with the stated covariances: the
 mean of the squared errors in terms of the covariance (NEES, 6 where it is right) and how often the 95 % ball at targets
-100 mm from the origin holds the error. Exit code 1 where a figure is outside its limits.
+100 mm from the origin holds the error. And the worst cases for spots that are off by no more than so much are compared
+with what the solver makes of such spots. Exit code 1 where a figure is outside its limits.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from tqdm import tqdm
 
 from benchmarks.pose_statistics import PoseStatistics
 from benchmarks.rod_layouts import best_subset, well_conditioned_frame
+from benchmarks.worst_cases import WorstCaseCount, count_worst_cases
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
@@ -86,6 +88,18 @@ RENDERED_CASES = (
     Case("cube6", 6, rendered=True),
     Case("", 8, rendered=True),
 )
+
+
+# Frame, rods, and the largest error of a spot, pixel; whether that is in the range in which all is linear.
+WORST_CASES = (
+    (Case("", 4), 0.005, True),
+    (Case("cube6", 6), 0.02, True),
+    (Case("", 8), 0.02, True),
+    (Case("cube6", 6), 0.1, False),
+    (Case("cube6", 6), 0.3, False),
+)
+# Share of a bound that the corner named for it has to reach, in the median pose, where all is linear.
+_TIGHT = 0.9
 
 
 def measure_spot_sets(case: Case, sets: int, seed: int) -> PoseStatistics:
@@ -172,11 +186,53 @@ def within_limits(case: Case, statistics: PoseStatistics) -> bool:
     return right and bool((np.abs(statistics.coverage - 0.95) <= slack).all())
 
 
+def is_sound(found: WorstCaseCount, linear: bool) -> bool:
+    """Whether no error was beyond its bound, and, where all is linear, the bounds are nearly reached."""
+    return found.exceeded == 0 and (not linear or float(np.median(found.reached)) >= _TIGHT)
+
+
+def _worst_cases(trials: int, seed: int, records: list[dict[str, Any]]) -> bool:
+    """Print and record the worst cases; whether a figure is outside its limits."""
+    failed = False
+    print(
+        "\nworst cases         spots off by   poses  unproven   trials  beyond a bound  nearest  reached: median, least"
+    )
+    for case, max_error_px, linear in WORST_CASES:
+        found = count_worst_cases(case.make_frame(), max_error_px, trials // len(WORST_CASES), seed)
+        good = is_sound(found, linear)
+        failed |= not good
+        median, least = (
+            (float(np.median(found.reached)), float(found.reached.min())) if found.reached.size else (0.0, 0.0)
+        )
+        print(
+            f"{case.frame or 'generated':10s} {case.rods} rods  {max_error_px:8g} px   {found.scenes:5d}  "
+            f"{found.unproven:8d}  {found.trials:7d}  {found.exceeded:14d}  {found.nearest:7.3f}  {median:.3f}, {least:.3f}  "
+            f"{'' if good else 'OUTSIDE'}",
+            flush=True,
+        )
+        records.append(
+            {
+                "case": f"worst case, {case.name}",
+                "max_error_px": max_error_px,
+                "poses": found.scenes,
+                "unproven": found.unproven,
+                "trials": found.trials,
+                "exceeded": found.exceeded,
+                "nearest": found.nearest,
+                "reached": found.reached.tolist(),
+            }
+        )
+    return failed
+
+
 def main() -> int:
     """Print the table and write it as JSON; 1 where a figure is outside its limits."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.uncertainty", description=__doc__)
     parser.add_argument("--sets", type=int, default=10_000, help="spot sets of each case (default 10000)")
     parser.add_argument("--slices", type=int, default=1000, help="rendered slices of each case (default 1000)")
+    parser.add_argument(
+        "--trials", type=int, default=100_000, help="errors of spots for the worst cases, in all (default 100000)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default 0)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: all cores)")
     parser.add_argument("--output", type=Path, default=Path("build/uncertainty.json"), help="JSON file to write")
@@ -209,6 +265,8 @@ def main() -> int:
                 "coverage": found.coverage.tolist(),
             }
         )
+    if arguments.trials:
+        failed |= _worst_cases(arguments.trials, arguments.seed, records)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(json.dumps(records, indent=1) + "\n")
     print(f"\nas JSON: {arguments.output}")
