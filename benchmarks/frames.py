@@ -11,7 +11,7 @@ from tqdm import tqdm
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.design.ambiguity import reasons, trials
 from stereoreg_ros.design.expected_error import Imaging
-from stereoreg_ros.design.layouts import Envelope, Layouts, least_gaps
+from stereoreg_ros.design.layouts import Envelope, Layouts, gaps
 from stereoreg_ros.design.meeting import meetings
 from stereoreg_ros.design.search import Wish, random_layouts
 
@@ -37,7 +37,7 @@ def main() -> int:
         frame = load_frame(name)
         wish = Wish(ENVELOPE, tuple(frame.diameters), IMAGING, TARGET_MM, TILT_DEG, HEIGHT_MM)
         error = float(wish.target_errors(Layouts.of(frame))[0])
-        drawn = np.array(list(random_layouts(wish, arguments.layouts, np.random.default_rng(0))))
+        drawn = random_layouts(wish, arguments.layouts, np.random.default_rng(0))
         random = np.concatenate([wish.costs(part) for part in np.array_split(drawn, max(1, len(drawn) // 100))])
         options = RegistrationOptions(spot_noise_px=IMAGING.noise_px, slice_thickness_mm=IMAGING.thickness_mm)
         poses = meetings(arguments.poses, 7, np.zeros(3), np.array([-HEIGHT_MM, HEIGHT_MM]), TILT_DEG)
@@ -48,7 +48,7 @@ def main() -> int:
         counts = reasons(made)
         wrong = sum(not trial.reason and not trial.right for trial in made)
         print(
-            f"{name:6} {len(frame):4}  {least_gaps(Layouts.of(frame))[0]:6.2f}  {error:20.3f}  {random.min():11.3f}  "
+            f"{name:6} {len(frame):4}  {gaps(Layouts.of(frame)).min():6.2f}  {error:20.3f}  {random.min():11.3f}  "
             f"{np.median(random):13.3f}  {total:5}  {counts['accepted']:8}  {counts['ambiguous']:9}  {wrong:5}",
             flush=True,
         )
