@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "result": {"geometry", "options", "uncertainty"},
     "registration": {"geometry", "options", "spots", "solvers", "matching", "result", "uncertainty"},
     "calibration": {"geometry", "options", "solvers", "result", "registration"},
+    "worst_case": {"geometry", "solvers", "result", "registration"},
     "drawing": {"geometry", "options", "result", "registration"},
 }
 

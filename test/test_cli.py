@@ -93,6 +93,35 @@ def test_accepted_slice_as_json(stereoreg, cube_slice):
         assert 0 <= match["residual_mm"] < 0.5
 
 
+WORST_KEYS = ["worst_case_target_error_mm", "worst_case_position_mm", "worst_case_rotation_deg"]
+
+
+def test_worst_case_on_demand(stereoreg, cube_slice, tmp_path):
+    target = ("--target-in-frame-mm", 0, 0, 100)
+    dark = write_hu(tmp_path / "dark.dcm", np.full((64, 64), -1000))
+    told = ("register", "--frame", "cube6", *target, "--max-spot-error", 0.05)
+    code, output, errors = stereoreg(*told, "--json", cube_slice, dark)
+    assert (code, errors) == (0, "")
+    found, refused = objects(output)
+    bounds = [found[key] for key in WORST_KEYS]
+    assert all(0 < bound < 5 for bound in [bounds[0], *bounds[1], *bounds[2]])
+    assert [len(bound) for bound in bounds[1:]] == [3, 3]
+    assert refused["outcome"] == "refused"
+    assert [refused[key] for key in WORST_KEYS] == [None] * 3
+    # Of 0.02 pixel it is two fifths, but for the second order.
+    (smaller,) = objects(stereoreg(*told[:-1], 0.02, "--json", cube_slice)[1])
+    assert smaller[WORST_KEYS[0]] == pytest.approx(0.4 * bounds[0], rel=0.1)
+    line = stereoreg(*told, cube_slice)[1].splitlines()[1]
+    assert f"target off by at most {bounds[0]:.2f} mm" in line
+    assert "no bound of the target's error for spots 9 pixel off" in stereoreg(*told[:-1], 9, cube_slice)[1]
+    (beyond,) = objects(stereoreg(*told[:-1], 9, "--json", cube_slice)[1])
+    assert [beyond[key] for key in WORST_KEYS] == [None] * 3
+    truth = SCANNER_FROM_SLICE @ SLICE_FROM_FRAME
+    pose = found["scanner_from_frame"]
+    stated = Pose.from_quaternion(pose["quaternion_xyzw"], pose["position_mm"])
+    assert np.linalg.norm(stated @ np.array([0.0, 0, 100]) - truth @ np.array([0.0, 0, 100])) < bounds[0]
+
+
 def test_table_for_people(stereoreg, cube_slice, tmp_path):
     dark = write_hu(tmp_path / "dark.dcm", np.full((64, 64), -1000))
     code, output, errors = stereoreg("register", "--frame", "cube6", cube_slice, dark)
@@ -188,6 +217,8 @@ def test_every_option_has_its_flag(stereoreg, cube_slice, monkeypatch):
         nominal_orientation=(-1e-3, 0.0, -1.0, 0.5),
         max_rotation_deg=20.0,
         max_position_std_mm=2.0,
+        target_in_frame_mm=(0.0, -30.0, 1e2),
+        max_target_error_mm=3.0,
     )
     flags = []
     for entry in fields(RegistrationOptions):
@@ -216,6 +247,19 @@ def test_every_option_has_its_flag(stereoreg, cube_slice, monkeypatch):
         (["register", "--frame", "cube6", "--nominal-orientation", *"0000", "x.dcm"], "nominal_orientation"),
         (["register", "--frame", "cube6", "--pixel-spacing", "0", "1", "x.dcm"], "sx is 0.0, expected a positive"),
         (["register", "--frame", "cube6", "--pixel-shear", "inf", "x.dcm"], "shear is inf"),
+        (["register", "--frame", "cube6", "--target-in-frame-mm", "0", "nan", "0", "x.dcm"], "target_in_frame_mm is"),
+        (
+            ["register", "--frame", "cube6", "--max-target-error-mm", "0", "x.dcm"],
+            "max_target_error_mm is 0.0, expected",
+        ),
+        (
+            ["register", "--frame", "cube6", "--max-spot-error", "-1", "x.dcm"],
+            "max_spot_error is -1.0, expected a number",
+        ),
+        (
+            ["register", "--frame", "cube6", "--max-spot-error", "nan", "x.dcm"],
+            "max_spot_error is nan, expected a number",
+        ),
     ],
 )
 def test_wrong_calls(stereoreg, arguments, sentence):

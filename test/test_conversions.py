@@ -163,7 +163,7 @@ def test_covariance_is_that_of_the_axes_and_the_order_of_ros():
     for which in range(6):
         deviation = np.array([0.3, 0.5, 0.7, 0.002, 0.003, 0.005])[which]
         ros = np.reshape(conversions.covariance_to_message(deviation**2 * np.outer(axes[which], axes[which])), (6, 6))
-        (told,) = np.flatnonzero(np.diag(ros))
+        (told,) = (int(row) for row in np.flatnonzero(np.diag(ros)))
         size = np.sqrt(ros[told, told])
         moved = pose.perturbed(deviation * axes[which, :3], deviation * axes[which, 3:])
         rest, message = conversions.pose_to_message(pose), conversions.pose_to_message(moved)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from stereoreg_ros import load_frame
-from stereoreg_ros.design.layouts import Envelope, Layouts, least_gaps
+from stereoreg_ros.design.layouts import Envelope, Layouts, gaps
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.simulation import ScannerSettings, random_pose
 
@@ -33,15 +33,15 @@ def test_gaps_against_a_minimiser(seed: int) -> None:
     rng = np.random.default_rng(seed)
     starts, ends = rng.uniform(-30, 30, (2, 1, 2, 3))
     expected = gap_by_search(starts[0, 0], ends[0, 0], starts[0, 1], ends[0, 1]) - 1.5
-    assert least_gaps(Layouts(starts, ends, np.array([1.0, 2.0])))[0] == pytest.approx(expected, abs=1e-4)
+    assert gaps(Layouts(starts, ends, np.array([1.0, 2.0])))[0, 0] == pytest.approx(expected, abs=1e-4)
 
 
 def test_parallel_rods() -> None:
     starts = np.array([[[0.0, 0, 0], [3, 4, 5]]])
     ends = starts + UP
-    assert least_gaps(Layouts(starts, ends, np.ones(2)))[0] == pytest.approx(4.0)
+    assert gaps(Layouts(starts, ends, np.ones(2)))[0, 0] == pytest.approx(4.0)
     apart = starts + np.array([[[0, 0, 0], [0, 0, 20]]])
-    assert least_gaps(Layouts(apart, apart + UP, np.ones(2)))[0] == pytest.approx(np.hypot(5, 15) - 1)
+    assert gaps(Layouts(apart, apart + UP, np.ones(2)))[0, 0] == pytest.approx(np.hypot(5, 15) - 1)
 
 
 def test_all_inside_the_envelope() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from real_images import CATPHAN_OPTIONS, catphan, height, shows_module
+from scipy.stats import chi2
 
 from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.geometry.pose import Pose
@@ -104,6 +105,25 @@ def test_slices_that_show_the_module_are_accepted_and_step_with_the_table(scan, 
     assert inner.std() <= 0.15
     assert off.std() <= 0.15
     assert steps.std() <= 0.2
+
+
+def test_heights_spread_as_stated(scan, frame):
+    """Chi-square of the heights less the table's, in terms of their stated variances, between its 1 and 99 % points.
+
+    Over the slices through which the wires run from side to side: where they end within a slice, spots are a millimetre
+    off, which no covariance knows.
+    """
+    off, variances = [], []
+    for one in [one for one in scan if shows_module(one)][1:-1]:
+        result = register_slice(replace(one.ct_slice, scanner_from_slice=Pose.identity()), frame, CATPHAN_OPTIONS)
+        assert result
+        off.append(-result.scanner_from_frame.translation[2] - height(one))
+        variances.append(result.covariance[2, 2])
+    away = np.array(off) - np.average(off, weights=1 / np.array(variances))
+    chi_square = float((away**2 / variances).sum())
+    print(f"chi-square {chi_square:.2f} of {len(off) - 1} degrees of freedom")
+    low, high = chi2.ppf([0.01, 0.99], len(off) - 1)
+    assert low < chi_square < high
 
 
 def test_slices_without_the_module_are_refused(scan, frame):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from real_images import ZFRAME_OPTIONS, height, zframe
+from scipy.stats import chi2
 
 from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.geometry.pose import Pose
@@ -55,6 +56,24 @@ def test_with_prior_is_accepted_and_steps_with_the_table(volume, frame, threshol
     # Air bubbles in the tubes of slices 6 and 11 shift single spots: each step has the spread, their mean has not.
     assert abs(steps.mean() - 2.4) <= 0.05
     assert np.sqrt(np.mean((steps - 2.4) ** 2)) <= 0.3
+
+
+@THRESHOLDS
+def test_heights_spread_as_stated(volume, frame, threshold):
+    """Chi-square of the heights less the table's, in terms of their stated variances, between its 1 and 99 % points."""
+    off, variances = [], []
+    for number in FULL:
+        one = volume[number].ct_slice
+        options = replace(ZFRAME_OPTIONS, threshold=threshold)
+        result = register_slice(replace(one, scanner_from_slice=Pose.identity()), frame, options)
+        assert result
+        off.append(-result.scanner_from_frame.translation[2] - height(volume[number]))
+        variances.append(result.covariance[2, 2])
+    away = np.array(off) - np.average(off, weights=1 / np.array(variances))
+    chi_square = float((away**2 / variances).sum())
+    print(f"chi-square {chi_square:.2f} of {len(off) - 1} degrees of freedom")
+    low, high = chi2.ppf([0.01, 0.99], len(off) - 1)
+    assert low < chi_square < high
 
 
 def test_auto_offers_the_seven_tubes_and_hardly_more(volume):

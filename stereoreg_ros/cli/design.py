@@ -67,7 +67,7 @@ def add_to(commands: Commands) -> None:
         type=float,
         help="largest distance of a slice from the frame's middle, mm (default: a quarter of the box's height)",
     )
-    design.add_argument("--generations", metavar="N", type=int, default=600, help="length of the search (default: 600)")
+    design.add_argument("--chains", metavar="N", type=int, default=8, help="searches, the best counts (default: 8)")
     add_slices(design.add_argument_group("slices"))
     add_options(design.add_argument_group("registration"), RegistrationOptions, USED_OPTIONS)
     design.set_defaults(command=_design)
@@ -77,8 +77,8 @@ def _design(arguments: argparse.Namespace) -> int:
     """`stereoreg design`."""
     if not arguments.name.replace("_", "").replace("-", "").isalnum():
         raise WrongCallError(f"--name is {arguments.name!r}, expected letters, digits, '_' and '-'")
-    if not 1 <= arguments.generations <= 1_000_000:
-        raise WrongCallError(f"--generations is {arguments.generations}, expected 1 to 1000000")
+    if not 1 <= arguments.chains <= 10_000:
+        raise WrongCallError(f"--chains is {arguments.chains}, expected 1 to 10000")
     if arguments.seed < 0:
         raise WrongCallError(f"--seed is {arguments.seed}, expected 0 or more")
     make_folder("--output", arguments.output)
@@ -131,14 +131,14 @@ def _proposed(arguments: argparse.Namespace, wish: Wish, options: RegistrationOp
             bar.refresh()
             return True
 
-        return propose(wish, arguments.name, options, arguments.seed, arguments.generations, tell)
+        return propose(wish, arguments.name, options, arguments.seed, arguments.chains, tell)
 
 
 def _comment(arguments: argparse.Namespace, proposal: Proposal) -> str:
     """What came of it, and the call that brings it again."""
     asked = ["stereoreg", "design"]
     names = ("name", "lines", "envelope", "diameter", "gap", "height", "tilt", "pixel_spacing", *USED_OPTIONS)
-    for name in (*names, "generations", "seed"):
+    for name in (*names, "chains", "seed"):
         value = getattr(arguments, name)
         if value is not None:
             values = value if isinstance(value, (tuple, list)) else [value]

@@ -26,8 +26,10 @@ from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.registration import register_slice
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration, diagnostics
+from stereoreg_ros.worst_case import WorstCase, worst_case
 
 _TABLE_HEAD: Final = f"{'slice':{NAME_WIDTH}}  {'outcome':13}  {'rods':>8}  {'residual':>9}  position in the scanner"
+_LARGEST_SPOT_ERROR_PX: Final = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,8 @@ class _Registered:
     ct_slice: Slice
     result: Registration | Refusal
     duration_s: float
+    max_spot_error_px: float | None
+    worst: WorstCase | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +65,12 @@ def add_to(commands: Commands) -> None:
     register.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
     register.add_argument("--json", action="store_true", help="print one JSON object per slice, each on a line")
     register.add_argument("--overlay", metavar="DIR", type=Path, help="write a picture of each slice to this folder")
+    register.add_argument(
+        "--max-spot-error",
+        metavar="PX",
+        type=float,
+        help="bound the errors of the pose and at the target where no coordinate of a spot is off by more, pixel",
+    )
     scale = register.add_argument_group("pixel scale")
     scale.add_argument(
         "--pixel-spacing",
@@ -84,6 +94,7 @@ def _register(arguments: argparse.Namespace) -> int:
         # A scale for nothing but the check, where the spacing is the file's.
         sx, sy = arguments.pixel_spacing or (1.0, 1.0)
         own_scale = PixelScale(sx, sy, arguments.pixel_shear)
+        _check_spot_error(arguments.max_spot_error)
     except (FrameFileError, ValueError) as error:
         raise WrongCallError(str(error)) from None
     pictures = _Pictures(arguments.overlay) if arguments.overlay is not None else None
@@ -96,7 +107,7 @@ def _register(arguments: argparse.Namespace) -> int:
             complain(str(ct_slice))
         else:
             scale = own_scale if arguments.pixel_spacing else replace(ct_slice.scale, shear=own_scale.shear)
-            outcome = _timed(path, replace(ct_slice, scale=scale), frame, options)
+            outcome = _timed(path, replace(ct_slice, scale=scale), frame, options, arguments.max_spot_error)
         print_line(json.dumps(_record(outcome, frame), allow_nan=False) if arguments.json else _table_line(outcome))
         outcomes[_word(outcome)] += 1
         if pictures is not None and isinstance(outcome, _Registered):
@@ -106,10 +117,21 @@ def _register(arguments: argparse.Namespace) -> int:
     return BAD_FILE if outcomes["bad_image"] else OK
 
 
-def _timed(path: Path, ct_slice: Slice, frame: Frame, options: RegistrationOptions) -> _Registered:
+def _check_spot_error(max_spot_error_px: float | None) -> None:
+    if max_spot_error_px is not None and not 0 <= max_spot_error_px <= _LARGEST_SPOT_ERROR_PX:
+        raise ValueError(
+            f"max_spot_error is {max_spot_error_px!r}, expected a number from 0 to {_LARGEST_SPOT_ERROR_PX:g} pixel"
+        )
+
+
+def _timed(
+    path: Path, ct_slice: Slice, frame: Frame, options: RegistrationOptions, max_spot_error_px: float | None
+) -> _Registered:
     begin = time.perf_counter()
     result = register_slice(ct_slice, frame, options)
-    return _Registered(path, ct_slice, result, time.perf_counter() - begin)
+    duration_s = time.perf_counter() - begin
+    worst = worst_case(result, max_spot_error_px) if result and max_spot_error_px is not None else None
+    return _Registered(path, ct_slice, result, duration_s, max_spot_error_px, worst)
 
 
 def _word(outcome: _Registered | _Unreadable) -> str:
@@ -134,12 +156,23 @@ def _record(outcome: _Registered | _Unreadable, frame: Frame) -> dict[str, Any]:
             record["message"] = result.message
         elif result.caution:
             record["caution"] = result.caution
+        if outcome.max_spot_error_px is not None:
+            record |= _worst_record(outcome.worst)
     record["scanner_from_frame"] = _pose_record(result.scanner_from_frame) if result else None
     record["matches"] = [_match_record(match) for match in result.matches] if result else []
     if not result and result.reason == "ambiguous":
         record["alternatives"] = [_alternative_record(estimate) for estimate in result.estimates]
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in record.items()
+    }
+
+
+def _worst_record(worst: WorstCase | None) -> dict[str, Any]:
+    """Bounds of the errors; null where there is no pose, or where none can be proven."""
+    return {
+        "worst_case_target_error_mm": worst.target_error_mm if worst else None,
+        "worst_case_position_mm": worst.position_mm.tolist() if worst else None,
+        "worst_case_rotation_deg": worst.rotation_deg.tolist() if worst else None,
     }
 
 
@@ -173,10 +206,19 @@ def _table_line(outcome: _Registered | _Unreadable) -> str:
             rods, residual = f"{best.inliers} of {len(result.frame)}", f"{best.residual_rms_mm:.2f} mm"
         if result:
             x, y, z = result.scanner_from_frame.translation
-            last = f"{x:.1f}, {y:.1f}, {z:.1f} mm" + (f"; {result.caution}" if result.caution else "")
+            last = f"{x:.1f}, {y:.1f}, {z:.1f} mm"
+            if outcome.max_spot_error_px is not None:
+                last += f"; {_worst_words(outcome.max_spot_error_px, outcome.worst)}"
+            last += f"; {result.caution}" if result.caution else ""
         else:
             last = result.message
     return f"{name:{NAME_WIDTH}}  {_word(outcome):13}  {rods:>8}  {residual:>9}  {last}"
+
+
+def _worst_words(max_spot_error_px: float, worst: WorstCase | None) -> str:
+    if worst is None:
+        return f"no bound of the target's error for spots {max_spot_error_px:g} pixel off"
+    return f"target off by at most {worst.target_error_mm:.2f} mm"
 
 
 def _summary(outcomes: Counter[str]) -> str:

@@ -17,6 +17,8 @@ from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.registration import register_spots
 
+_PIXELS = 512 * 512
+
 
 @dataclass(frozen=True, eq=False)
 class Trial:
@@ -41,14 +43,18 @@ def trials(
     left_out: Sequence[int | None],
     rng: np.random.Generator,
 ) -> Iterator[Trial]:
-    """Register the frame from the spots of each pose, with the stated noise, for each choice of a rod left out."""
+    """Register the frame from the spots of each pose, with the stated noise, for each choice of a rod left out.
+
+    The spots are taken to be all that a slice of 512 x 512 pixels shows.
+    """
+    area_mm2 = _PIXELS * scale.sx * scale.sy
     for row in range(len(poses)):
         slice_from_frame = poses.pose(row)
         spots_px, cuts = project(frame, slice_from_frame, scale)
         for out in left_out:
             lines = np.flatnonzero(cuts.inside & (np.arange(len(frame)) != (-1 if out is None else out)))
             noisy = spots_px[lines] + options.spot_noise_px * rng.standard_normal((len(lines), 2))
-            result = register_spots(noisy, frame, scale, options)
+            result = register_spots(noisy, frame, scale, options, slice_area_mm2=area_mm2)
             estimates = (result.estimate,) if result else result.estimates
             explanations = [[match.line_index for match in sorted(one.matches, key=_spot)] for one in estimates]
             spots = [[match.spot for match in sorted(one.matches, key=_spot)] for one in estimates]

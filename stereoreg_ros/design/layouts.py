@@ -92,15 +92,14 @@ class Envelope:
         )
 
 
-def least_gaps(layouts: Layouts) -> Array:
-    """Least distance (s,) in mm between the surfaces of two rods of a layout; negative where they cross."""
+def gaps(layouts: Layouts) -> Array:
+    """Distances (s, n (n - 1) / 2) in mm between the surfaces of every two rods; negative where they cross."""
     first, second = np.triu_indices(len(layouts.diameters), 1)
-    gaps = _distances(
+    axes = _distances(
         layouts.starts[:, first], layouts.ends[:, first], layouts.starts[:, second], layouts.ends[:, second]
     )
-    gaps -= 0.5 * (layouts.diameters[first] + layouts.diameters[second])
-    least: Array = gaps.min(axis=-1)
-    return least
+    surfaces: Array = axes - 0.5 * (layouts.diameters[first] + layouts.diameters[second])
+    return surfaces
 
 
 def _distances(start_a: Array, end_a: Array, start_b: Array, end_b: Array) -> Array:

@@ -36,7 +36,7 @@ def propose(
     name: str,
     options: RegistrationOptions,
     seed: int,
-    generations: int,
+    chains: int,
     progress: Callable[[str, float, float], bool] | None = None,
 ) -> Proposal:
     """The first of a few searches, each with a seed of its own, whose frame is never ambiguous; else the least so.
@@ -51,7 +51,7 @@ def propose(
         def tell(share: float, least: float, what: str = what) -> bool:
             return progress is None or progress(what, share, least)
 
-        found = search(wish, seed + attempt, generations, tell)
+        found = search(wish, seed + attempt, chains, tell)
         layouts = wish.envelope.layouts(found.corners[None], wish.diameters_mm)
         rounded = Layouts(np.round(layouts.starts, 1), np.round(layouts.ends, 1), layouts.diameters)
         frame, error = rounded.frame(0, name), float(wish.target_errors(rounded)[0])

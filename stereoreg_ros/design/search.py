@@ -1,26 +1,29 @@
-"""Layouts of rods with the least target error, by scipy's differential evolution."""
+"""Layouts of rods with the least target error, by scipy's basin hopping."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from joblib import Parallel, delayed
-from scipy.optimize import differential_evolution
+from joblib import Parallel, delayed, effective_n_jobs
+from numpy.typing import NDArray
+from scipy.optimize import basinhopping
 
 from stereoreg_ros.design.expected_error import Imaging, expected, point_covariances, pooled_error_95
-from stereoreg_ros.design.layouts import Envelope, Layouts, least_gaps
+from stereoreg_ros.design.layouts import Envelope, Layouts, gaps
 from stereoreg_ros.design.meeting import Meetings, meetings
 from stereoreg_ros.geometry.pose import Array
 
-# mm of target error for each mm that two rods are too near: more than any layout gains by it.
-_TOO_NEAR = 100.0
-# Layouts of a batch that one core evaluates at a time, small enough for its cache.
-_BATCH = 32
 _POSES = 64
-# Ends are rounded to a tenth of a millimetre, which can bring two rods this much nearer.
-_ROUNDING_MM = 0.15
+# Ends are rounded to a tenth of a millimetre, which can bring two rods so much nearer; the descent, which weighs a gap
+# against an error, may fall short by the rest of the margin.
+_ROUNDING_MM, _MARGIN_MM = 0.15, 0.2
+# Random layouts of which the best is a start, hops of a chain, steps of a descent, and the error by which a hop may be
+# worse and still be taken, now and then.
+_DRAWN, _HOPS, _DESCENT, _TEMPERATURE_MM = 50, 10, 80, 0.02
+# Of the differences that the slope is made of, as a share of the envelope.
+_STEP = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +68,16 @@ class Wish:
         return pooled_error_95(point_covariances(covariances, self.poses.rotations, np.array(self.target_mm)))
 
     def costs(self, corners: Array) -> Array:
-        """Target error (s,) of layouts (s, 4 n), raised where rods are nearer than the envelope's gap."""
+        """Target error (s,) of layouts (s, 4 n), raised by the square of what rods are too near, mm."""
         layouts = self.envelope.layouts(corners, self.diameters_mm)
-        return self.target_errors(layouts) + _TOO_NEAR * self.shortfalls_mm(corners)
+        short_mm = np.maximum(self.envelope.gap_mm + _MARGIN_MM - gaps(layouts), 0.0)
+        costs: Array = self.target_errors(layouts) + (short_mm**2).sum(axis=1)
+        return costs
 
-    def shortfalls_mm(self, corners: Array) -> Array:
-        """By how much (s,) the rods are nearer than the envelope's gap, and what rounding may take of it."""
-        gaps = least_gaps(self.envelope.layouts(corners, self.diameters_mm))
-        return np.maximum(self.envelope.gap_mm + _ROUNDING_MM - gaps, 0.0)
+    def can_be_built(self, corners: Array) -> NDArray[np.bool_]:
+        """Whether the rods of layouts (s, 4 n) keep the envelope's gap, also when their ends are rounded."""
+        layouts = self.envelope.layouts(corners, self.diameters_mm)
+        return np.asarray(gaps(layouts).min(axis=1) >= self.envelope.gap_mm + _ROUNDING_MM)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,78 +93,79 @@ class Candidate:
     interrupted: bool
 
 
-def random_layouts(wish: Wish, count: int, rng: np.random.Generator) -> Iterator[Array]:
-    """`count` layouts (4 n,) that can be built, their rods' ends drawn evenly over the faces."""
-    found = 0
-    while found < count:
+def random_layouts(wish: Wish, count: int, rng: np.random.Generator) -> Array:
+    """`count` layouts (count, 4 n) that can be built, their rods' ends drawn evenly over the faces.
+
+    Raises ValueError where hardly any layout drawn so can be built.
+    """
+    found: list[Array] = []
+    for _ in range(max(100, 4 * count)):
         corners = rng.uniform(size=(256, 4 * len(wish.diameters_mm)))
-        gaps = least_gaps(wish.envelope.layouts(corners, wish.diameters_mm))
-        for row in np.flatnonzero(gaps >= wish.envelope.gap_mm)[: count - found]:
-            found += 1
-            yield corners[row]
+        found.extend(corners[wish.can_be_built(corners)])
+        if len(found) >= count:
+            return np.array(found[:count])
+    size = " x ".join(f"{length:g}" for length in wish.envelope.size_mm)
+    raise ValueError(
+        f"of random layouts of {len(wish.diameters_mm)} rods with {wish.envelope.gap_mm:g} mm between them "
+        f"hardly any fits into {size} mm; fewer rods, a smaller gap or a larger envelope is needed"
+    )
 
 
-def search(
-    wish: Wish, seed: int, generations: int, progress: Callable[[float, float], bool] | None = None
-) -> Candidate:
-    """The best layout of one run; progress: told the share done and the least error so far, says whether to go on.
+def search(wish: Wish, seed: int, chains: int, progress: Callable[[float, float], bool] | None = None) -> Candidate:
+    """The best layout of several chains of hops; progress: told the share done and the least error so far, mm.
 
-    Where that ends it, or an interruption (KeyboardInterrupt) does, the best layout so far is returned. The batches of
-    a generation are spread over the cores by joblib, in whatever backend its `parallel_config` has chosen.
+    Where progress says not to go on, or an interruption (KeyboardInterrupt) comes, the best layout so far is returned.
+    The chains are spread over the cores by joblib, in whatever backend its `parallel_config` has chosen.
     Raises ValueError where no layout that can be built was found.
     """
-    with Parallel(n_jobs=-1) as parallel:
-        evaluated = _Evaluated(wish, parallel)
-        done = 0
-
-        def after_generation(*_: object) -> bool:
-            nonlocal done
-            done += 1
-            return progress is not None and not progress(min(1.0, done / generations), evaluated.least)
-
-        interrupted = False
-        try:
-            differential_evolution(
-                lambda columns: evaluated(columns.T),
-                [(0.0, 1.0)] * (4 * len(wish.diameters_mm)),
-                strategy="currenttobest1bin",
-                maxiter=generations,
-                popsize=4,
-                tol=1e-4,
-                mutation=(0.3, 0.8),
-                recombination=0.8,
-                polish=False,
-                init="sobol",
-                updating="deferred",
-                vectorized=True,
-                callback=after_generation,
-                seed=np.random.default_rng(seed),
-            )
-        except KeyboardInterrupt:
-            interrupted = True
-    if evaluated.best is None or wish.shortfalls_mm(evaluated.best[None])[0] > _ROUNDING_MM:
-        size = " x ".join(f"{length:g}" for length in wish.envelope.size_mm)
-        raise ValueError(
-            f"no layout of {len(wish.diameters_mm)} rods with {wish.envelope.gap_mm:g} mm between them was found in "
-            f"{size} mm; fewer rods, a smaller gap, a larger envelope or more generations are needed"
-        )
-    return Candidate(evaluated.best, evaluated.least, interrupted)
+    seeds = np.random.SeedSequence(seed).spawn(chains + 1)
+    start = random_layouts(wish, _DRAWN, np.random.default_rng(seeds[-1]))
+    costs = wish.costs(start)
+    best, least = start[costs.argmin()], float(costs.min())
+    done, interrupted, together = 0, False, effective_n_jobs(-1)
+    try:
+        while done < chains and not interrupted:
+            # As many at a time as there are cores, so that somebody is told in between.
+            batch = seeds[done : min(done + together, chains)]
+            for corners, cost in Parallel(n_jobs=-1)(delayed(_chain)(wish, one) for one in batch):
+                if cost < least and wish.can_be_built(corners[None])[0]:
+                    best, least = corners, cost
+            done += len(batch)
+            interrupted = progress is not None and not progress(done / chains, least) and done < chains
+    except KeyboardInterrupt:
+        interrupted = True
+    error = wish.target_errors(wish.envelope.layouts(best[None], wish.diameters_mm))[0]
+    return Candidate(best, float(error), interrupted)
 
 
-class _Evaluated:
-    """Costs of layouts, and the best one met."""
+def _chain(wish: Wish, seed: np.random.SeedSequence) -> tuple[Array, float]:
+    """From the best of some random layouts: one rod is drawn anew, all descend together, the better layout stays."""
+    rng = np.random.default_rng(seed)
+    start = random_layouts(wish, _DRAWN, rng)
 
-    def __init__(self, wish: Wish, parallel: Parallel) -> None:
-        self.wish = wish
-        self.best: Array | None = None
-        self.least = np.inf
-        self._parallel = parallel
+    def redraw(corners: Array) -> Array:
+        moved = corners.copy()
+        rod = int(rng.integers(len(wish.diameters_mm)))
+        moved[4 * rod : 4 * rod + 4] = rng.uniform(size=4)
+        return moved
 
-    def __call__(self, corners: Array) -> Array:
-        corners = np.clip(corners, 0.0, 1.0)
-        batches = np.array_split(corners, max(1, len(corners) // _BATCH))
-        costs = np.concatenate(self._parallel(delayed(self.wish.costs)(batch) for batch in batches))
-        row = int(costs.argmin())
-        if costs[row] < self.least:
-            self.least, self.best = float(costs[row]), corners[row].copy()
-        return costs
+    def cost_and_slope(corners: Array) -> tuple[float, Array]:
+        inward = np.where(corners > 0.5, -_STEP, _STEP)
+        costs = wish.costs(np.concatenate([corners[None], corners + np.diag(inward)]))
+        return float(costs[0]), (costs[1:] - costs[0]) / inward
+
+    found = basinhopping(
+        cost_and_slope,
+        start[wish.costs(start).argmin()],
+        niter=_HOPS,
+        T=_TEMPERATURE_MM,
+        take_step=redraw,
+        minimizer_kwargs={
+            "method": "L-BFGS-B",
+            "jac": True,
+            "bounds": [(0.0, 1.0)] * start.shape[1],
+            "options": {"maxiter": _DESCENT},
+        },
+        seed=rng,
+    )
+    return np.clip(found.x, 0.0, 1.0), float(found.fun)

@@ -55,7 +55,7 @@ def centres_of_symmetry(
         compared = _compared(patches, centres, window, shut)
         centres = centres + np.clip(compared.step, -0.5, 0.5)
     inverse = _inverse(compared.information + np.eye(2) * 1e-12)
-    covariances = compared.variance[:, None, None] * inverse
+    covariances = compared.variance[:, None, None] * (inverse @ compared.by_noise @ inverse)
     # Where more than noise disturbs the symmetry, as the end of a rod within the slice or a bubble in a tube, there is
     # no centre of symmetry: the centroid is taken, and what the two differ by is an error.
     height = np.abs(patches).max(axis=(1, 2))
@@ -86,12 +86,14 @@ def _share_left(patches: Array, shut: NDArray[np.bool_], clipped: NDArray[np.boo
 
 class _Compared(NamedTuple):
     """Spots and their mirror images: step (n, 2) pixel to a better centre; information (n, 2, 2) HU^2 per pixel^2;
-    variance (n,) HU^2 of a pixel, by how the two differ.
+    variance (n,) HU^2 of a pixel, by how the two differ; by_noise (n, 2, 2) HU^2 per pixel^2, covariance of information
+    times step for a unit of it.
     """
 
     step: Array
     information: Array
     variance: Array
+    by_noise: Array
 
 
 def _compared(patches: Array, centres: Array, window: Array, shut: NDArray[np.bool_]) -> _Compared:
@@ -126,7 +128,12 @@ def _compared(patches: Array, centres: Array, window: Array, shut: NDArray[np.bo
     pairs = 0.5 * weight.sum(axis=(1, 2))
     variance = np.einsum("nij,nij,nij->n", weight, odd, odd) / np.maximum(np.einsum("nij,nij->n", weight, noise), 1e-9)
     variance *= np.maximum(pairs, 1.0) / np.maximum(pairs - 2.0, 1.0)
-    return _Compared(step, information, variance + _ROUNDING_HU2)
+    # A pixel's noise pulls at the centre by itself and by what it is of the mirror image.
+    pulls = np.stack(
+        [part - np.swapaxes(mirror_v, 1, 2) @ part @ mirror_u for part in (weighted_u, weighted_v)], axis=1
+    )
+    by_noise = 0.25 * np.einsum("naij,nbij->nab", pulls, pulls)
+    return _Compared(step, information, variance + _ROUNDING_HU2, by_noise)
 
 
 def _mirror(centres: Array, side: int) -> tuple[Array, Array]:
