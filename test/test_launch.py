@@ -12,10 +12,10 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 import yaml
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
