@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -53,18 +54,16 @@ def catphan_module(folder: Path) -> Path:
     return folder
 
 
-def run_example(name: str, *arguments: str | Path) -> str:
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / name), *map(str, arguments)],
-        cwd=REPOSITORY,
-        env={**os.environ, **ROS_ENVIRONMENT, "PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+def started(name: str, *arguments: str, **options: Any) -> subprocess.Popen[str]:
+    environment = {**os.environ, **ROS_ENVIRONMENT, "PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"}
+    return subprocess.Popen([sys.executable, str(EXAMPLES / name), *arguments], env=environment, text=True, **options)
+
+
+def run_example(name: str, *arguments: str) -> str:
+    process = started(name, *arguments, stdout=subprocess.PIPE)
+    said, _ = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, said
+    return said
 
 
 def registered_offline(series: Path, frame_name: str, options: RegistrationOptions) -> list[Pose | None]:
@@ -102,7 +101,7 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
     expected = registered_offline(series, frame, options)
     assert sum(pose is not None for pose in expected) >= accepted
 
-    said = run_example("slices_to_bag.py", series, bag, "--rate", "5")
+    said = run_example("slices_to_bag.py", str(series), str(bag), "--rate", "5")
     stamps = stamps_of_images(bag)
     assert len(set(stamps)) == len(expected)
 
@@ -113,10 +112,9 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
     with node_process("register_node", "--ros-args", *parameters), RosClient() as client:
         poses = client.collect(PoseStamped, "/pose")
         diagnostics = client.collect(DiagnosticArray, "/diagnostics")
-        player = subprocess.Popen(
-            [sys.executable, str(EXAMPLES / "play_bag.py"), str(bag)],
-            env={**os.environ, **ROS_ENVIRONMENT, "PYTHONPATH": str(REPOSITORY)},
-        )
+        printer = started("print_poses.py", stdout=subprocess.PIPE)
+        client.wait_for(lambda: client.node.count_subscribers("/pose") == 2, "the example that prints")
+        player = started("play_bag.py", str(bag))
         try:
 
             def outcomes() -> dict[tuple[int, int], str]:
@@ -131,10 +129,16 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
             accepted_stamps = {stamp for stamp, pose in zip(stamps, expected, strict=True) if pose is not None}
             client.wait_for(lambda: len(poses) >= len(accepted_stamps), "the poses")
             assert player.wait(DEADLINE_S) == 0
+            printer.send_signal(signal.SIGINT)
+            printed, _ = printer.communicate(timeout=DEADLINE_S)
         finally:
-            if player.poll() is None:
-                player.kill()
-                player.wait()
+            for process in (player, printer):
+                if process.poll() is None:
+                    process.kill()
+                    process.wait()
+    assert printer.returncode == 0
+    assert printed.count("frame at x") == len(accepted_stamps)
+    assert printed.count("register_node: registration: registered") == len(accepted_stamps)
     found = {(one.header.stamp.sec, one.header.stamp.nanosec): pose_from_message(one) for one in poses}
     assert set(found) == accepted_stamps
     assert {stamp for stamp, outcome in outcomes().items() if outcome == "accepted"} == accepted_stamps
