@@ -68,12 +68,13 @@ class ParameterTable(_Table):
 
 
 def _value(value: Any) -> str:
-    return str(yaml.safe_dump(value, default_flow_style=True)).removesuffix("\n...\n").strip()
+    text: str = yaml.safe_dump(value, default_flow_style=True)
+    return text.removesuffix("\n...\n").strip()
 
 
 def _allowed(entry: Entry) -> str:
     if entry.low is None or entry.high is None:
-        return entry.descriptor.additional_constraints
+        return str(entry.descriptor.additional_constraints)
     word = f", or `{entry.word}`" if entry.word else ""
     return f"{entry.low:g} to {entry.high:g}{word}"
 
@@ -86,7 +87,7 @@ class InterfaceTable(_Table):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
         rclpy.init(args=["--ros-args", "--log-level", "warn"])
         node = RegisterNode()
-        found: list[tuple[str, str, type]] = [
+        found: list[tuple[str, str, Any]] = [
             *(("in", one.topic_name, one.msg_type) for one in node.subscriptions),
             *(("out", one.topic_name, one.msg_type) for one in node.publishers),
             *(("service", one.srv_name, one.srv_type) for one in node.services),
