@@ -143,11 +143,9 @@ class _LoadMeter:
         self._start = self._used(), time.monotonic()
         self._largest = 0
 
-    def look(self) -> None:
-        self._largest = max(self._largest, self._process.memory_info().rss)
-
     def load(self) -> Load:
-        self.look()
+        """Until now; memory is the most that was seen at any call."""
+        self._largest = max(self._largest, self._process.memory_info().rss)
         used, begun = self._start
         return Load(100 * (self._used() - used) / (time.monotonic() - begun), self._largest / _MIB)
 
@@ -172,20 +170,21 @@ def _stream(listener: _Listener, node: _RegisterNode, rate: float, slices: int) 
     assert source.stdout is not None
     # Until the slices begin, the source is drawing them.
     _spin(listener, lambda: bool(heard.statuses) or source.poll() is not None, _DEADLINE_S)
-    meter, last = _LoadMeter(node.process), (0, time.monotonic())
+    meter = _LoadMeter(node.process)
+    answered, last_s, load = 0, time.monotonic(), meter.load()
+    stamps: list[int] = []
     with tqdm(total=WARM_UP + slices, desc=f"{rate:g} Hz", unit="slice", disable=None, leave=False) as bar:
-        while len(heard.statuses) < WARM_UP + slices:
+        while not stamps or not heard.statuses.keys() >= set(stamps):
             rclpy.spin_once(listener, timeout_sec=0.1)
-            if len(heard.statuses) > last[0]:
-                last = len(heard.statuses), time.monotonic()
-                bar.update(len(heard.statuses) - bar.n)
-                meter.look()
-            elif source.poll() is not None and time.monotonic() > last[1] + _SILENCE_S:
+            if len(heard.statuses) > answered:
+                answered, last_s, load = len(heard.statuses), time.monotonic(), meter.load()
+                bar.update(answered - bar.n)
+            elif stamps and time.monotonic() > last_s + _SILENCE_S:
                 break
-    load = meter.load()
-    stamps = [int(line) for line in source.communicate(timeout=_DEADLINE_S)[0].split()]
-    if source.returncode or not stamps:
-        raise RuntimeError(f"the slice source ended with exit code {source.returncode}")
+            if not stamps and source.poll() is not None:
+                stamps = [int(line) for line in source.stdout.read().split()]
+                if source.returncode or not stamps:
+                    raise RuntimeError(f"the slice source ended with exit code {source.returncode}")
     # The pose of the last slice may come after its status.
     _spin(listener, lambda: stamps[-1] in heard.poses, 1.0)
     latencies = np.array([1e-9 * (heard.poses[stamp] - stamp) for stamp in stamps if stamp in heard.poses])
