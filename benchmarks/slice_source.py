@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from itertools import chain, cycle
+from itertools import chain, cycle, islice
 from typing import Final
 
 import numpy as np
@@ -29,6 +29,8 @@ FRAME: Final = "cube6"
 SCANNER: Final = ScannerSettings(false_spots=24)
 _DRAWN: Final = 40
 _STEP_MM: Final = 0.5
+# Slices from the passage's turn on, where rods end within the slice: their spots are no proper ones.
+_LEFT_OUT: Final = 10
 _DEADLINE_S: Final = 30.0
 
 
@@ -73,7 +75,7 @@ def _draw() -> list[Image]:
     middle = random_pose(rng, frame, SCANNER, max_tilt_deg=10.0, max_depth_mm=0.0)
     poses = passage(frame, middle, _STEP_MM, min_rods=len(frame))
     images = []
-    for pose, _ in zip(poses, range(_DRAWN), strict=False):
+    for pose in islice(poses, _LEFT_OUT, _LEFT_OUT + _DRAWN):
         ct_slice = render_slice([PlacedFrame(frame, pose)], SCANNER, rng)
         image = image_from_hu(ct_slice.hu.astype(np.int16))
         image.header.frame_id = "scanner"
