@@ -36,12 +36,15 @@ SOURCES := $(shell find stereoreg_ros config launch resource -name __pycache__ -
 WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; \
             source install/setup.bash;
 
-.PHONY: help venv demo test lint bench catphan clean distclean
+.PHONY: help venv demo test colcon-test matrix docs lint bench catphan clean distclean
 
 help:
 	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
 	@echo 'make demo       simulated scanner and registration as two processes; SLICES=$(SLICES) DEMO_OUTPUT=$(DEMO_OUTPUT)'
 	@echo 'make test       all tests; PYTEST_ARGS="-k word" to choose'
+	@echo 'make colcon-test  the tests of the core as colcon runs them'
+	@echo 'make matrix     the most telling tests on other versions: Ubuntu 24.04, the newest, ROS 2 Kilted'
+	@echo 'make docs       the documentation as a site: build/docs/index.html'
 	@echo 'make lint       style and types'
 	@echo 'make bench      measurements'
 	@echo 'make clean      remove what was built; make distclean: .venv and downloads too'
@@ -80,6 +83,18 @@ demo: venv
 test: venv catphan
 	$(WITH_ROS) .venv/bin/python -m pytest $(PYTEST_ARGS)
 
+# colcon test is content where no test ran.
+colcon-test: venv
+	.ci/colcon-test
+
+matrix: $(INSTALLED)
+	.ci/matrix/run
+
+docs: $(INSTALLED)
+	rm -rf build/docs
+	.venv/bin/python -m sphinx --quiet --fail-on-warning --keep-going --builder html docs build/docs
+	@echo 'build/docs/index.html'
+
 lint: $(INSTALLED)
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
@@ -94,4 +109,4 @@ clean:
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf .venv .cache
+	rm -rf .venv .cache .matrix

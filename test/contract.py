@@ -21,3 +21,22 @@ DIAGNOSTIC_KEYS = [
     "calibration",
     "duration_ms",
 ]
+
+PUBLISHED = {
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "pose_with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "target_in_frame": "geometry_msgs/msg/PointStamped",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "overlay": "sensor_msgs/msg/Image",
+    "markers": "visualization_msgs/msg/MarkerArray",
+}
+SUBSCRIBED = {
+    "image": "sensor_msgs/msg/Image",
+    "slice_pose": "geometry_msgs/msg/PoseStamped",
+    "target": "geometry_msgs/msg/PointStamped",
+}
+SERVICES = {
+    "~/recalibrate": "std_srvs/srv/Trigger",
+    "~/reset_calibration": "std_srvs/srv/Trigger",
+}
+STATUS_NAME = "register_node: registration"

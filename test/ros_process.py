@@ -41,17 +41,22 @@ T = TypeVar("T")
 def command_of(executable: str) -> list[str]:
     """How `ros2 run` would start an executable: from the install folder here, or from a sourced workspace.
 
-    Where nothing is built, the module of this source tree runs instead.
+    Where nothing is built, or it was built for another Python, the module of this source tree runs instead.
     """
     place = Path("lib") / PACKAGE / executable
     installed = REPOSITORY / "install" / PACKAGE / place
-    if installed.is_file():
+    if installed.is_file() and _python_of(installed).parent == Path(sys.executable).parent:
         source = 'source "$1" && shift && exec "$@"'
         return ["bash", "-c", source, "bash", str(REPOSITORY / "install" / "setup.bash"), str(installed)]
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         if prefix and (Path(prefix) / place).is_file():
             return [str(Path(prefix) / place)]
     return [sys.executable, "-m", f"{PACKAGE}.nodes.{executable}"]
+
+
+def _python_of(script: Path) -> Path:
+    """The Python that a script's first line names."""
+    return Path(script.read_text().splitlines()[0].removeprefix("#!"))
 
 
 class NodeProcess:

@@ -1,86 +1,132 @@
-"""Layouts of rods: inside their envelope, and no nearer to each other than they are said to be."""
+"""What the layouts for RViz and Foxglove name is what the running node has: topics with their types, service, keys."""
 
 from __future__ import annotations
 
-import numpy as np
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import minimize
+import yaml
 
-from stereoreg_ros import load_frame
-from stereoreg_ros.design.layouts import Envelope, Layouts, gaps
-from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.simulation import ScannerSettings, random_pose
+pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
-UP = np.array([0.0, 0.0, 10.0])
+from contract import DIAGNOSTIC_KEYS, PUBLISHED, SERVICES, STATUS_NAME, SUBSCRIBED
+from node_interface import NodeInterface, interface_of
+from rclpy.qos import QoSDurabilityPolicy, QoSReliabilityPolicy
+from ros_process import REPOSITORY, RosClient, node_process
 
+from stereoreg_ros.nodes.parameters import Entry, entries_of
+from stereoreg_ros.nodes.simulate_node import SimulationSettings
 
-def gap_by_search(start_a, end_a, start_b, end_b) -> float:
-    """Distance of two segments by a minimiser that knows nothing of them."""
+RVIZ = yaml.safe_load((REPOSITORY / "config" / "stereoreg.rviz").read_text())["Visualization Manager"]
+FOXGLOVE = json.loads((REPOSITORY / "config" / "stereoreg.foxglove.json").read_text())
 
-    def squared(shares):
-        offset = start_a + shares[0] * (end_a - start_a) - start_b - shares[1] * (end_b - start_b)
-        return float(offset @ offset)
-
-    starts = [(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0), (0.5, 0.5)]
-    return min(float(np.sqrt(minimize(squared, s, bounds=[(0, 1)] * 2, tol=1e-14).fun)) for s in starts)
-
-
-@settings(deadline=None, max_examples=40)
-@given(seed=st.integers(0, 10_000))
-def test_gaps_against_a_minimiser(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    starts, ends = rng.uniform(-30, 30, (2, 1, 2, 3))
-    expected = gap_by_search(starts[0, 0], ends[0, 0], starts[0, 1], ends[0, 1]) - 1.5
-    assert gaps(Layouts(starts, ends, np.array([1.0, 2.0])))[0, 0] == pytest.approx(expected, abs=1e-4)
+RVIZ_TYPES = {
+    "MarkerArray": "visualization_msgs/msg/MarkerArray",
+    "PoseWithCovariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "PointStamped": "geometry_msgs/msg/PointStamped",
+    "Image": "sensor_msgs/msg/Image",
+    "PublishPoint": "geometry_msgs/msg/PointStamped",
+}
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+PLOTTED = re.compile(r'(?P<topic>/\w+)\.status\[:\]{name=="(?P<name>[^"]+)"}\.values\[:\]{key=="(?P<key>\w+)"}\.value')
 
 
-def test_parallel_rods() -> None:
-    starts = np.array([[[0.0, 0, 0], [3, 4, 5]]])
-    ends = starts + UP
-    assert gaps(Layouts(starts, ends, np.ones(2)))[0, 0] == pytest.approx(4.0)
-    apart = starts + np.array([[[0, 0, 0], [0, 0, 20]]])
-    assert gaps(Layouts(apart, apart + UP, np.ones(2)))[0, 0] == pytest.approx(np.hypot(5, 15) - 1)
+@pytest.fixture(scope="module")
+def client() -> Iterator[RosClient]:
+    with node_process("register_node"), RosClient() as client:
+        yield client
 
 
-def test_all_inside_the_envelope() -> None:
-    rng = np.random.default_rng(0)
-    envelope = Envelope((60.0, 40.0, 80.0), 2.0)
-    diameters = np.array([1.0, 2.0, 3.0, 1.0])
-    corners = rng.uniform(size=(50, 16))
-    corners[0], corners[1] = 0.0, 1.0
-    layouts = envelope.layouts(corners, diameters)
-    for points in (layouts.starts, layouts.ends):
-        assert (np.abs(points[..., 0]) <= 30 - diameters / 2 + 1e-12).all()
-        assert (np.abs(points[..., 1]) <= 20 - diameters / 2 + 1e-12).all()
-    assert (layouts.starts[..., 2] == -40).all()
-    assert (layouts.ends[..., 2] == 40).all()
+@pytest.fixture(scope="module")
+def node(client) -> NodeInterface:
+    return interface_of(client, "register_node", [*PUBLISHED, *SUBSCRIBED, *SERVICES])
 
 
-def test_cut_many_layouts_at_once() -> None:
-    """The same as one frame and one pose after the other."""
-    rng = np.random.default_rng(1)
-    layouts = Envelope((60.0, 60.0, 60.0)).layouts(rng.uniform(size=(5, 24)), np.ones(6))
-    poses = [random_pose(rng, load_frame("cube6"), ScannerSettings()) for _ in range(4)]
-    rotations, translations = np.array([p.rotation for p in poses]), np.array([p.translation for p in poses])
-    many = cut(layouts, rotations, translations)
-    for row in range(5):
-        for column, pose in enumerate(poses):
-            one = cut(layouts.frame(row, "one"), pose.rotation, pose.translation)
-            np.testing.assert_allclose(many.points_mm[row, column], one.points_mm, atol=1e-9)
-            np.testing.assert_array_equal(many.inside[row, column], one.inside)
+def panels(kind: str) -> list[dict[str, Any]]:
+    return [config for name, config in FOXGLOVE["configById"].items() if name.split("!")[0] == kind]
 
 
-@pytest.mark.parametrize(
-    ("size", "gap", "what"),
-    [
-        ((60, 60), 3, "envelope is"),
-        ((60, 60, 0), 3, "envelope is"),
-        ((60, 60, 60), -1, "gap is"),
-        ((9, 9, 9), 10, "gap is"),
-    ],
-)
-def test_wrong_envelopes(size, gap, what) -> None:
-    with pytest.raises(ValueError, match=what):
-        Envelope(size, gap)
+def rviz_parts() -> list[dict[str, Any]]:
+    return [part for part in [*RVIZ["Displays"], *RVIZ["Tools"]] if "Topic" in part]
+
+
+def test_rviz_shows_what_the_node_publishes(node):
+    shown = {}
+    for part in rviz_parts():
+        kind = part["Class"].removeprefix("rviz_default_plugins/")
+        topic = part["Topic"]["Value"]
+        # The target is told to the node, all else comes from it.
+        known = node.subscribed if topic == "/target" else node.published
+        assert known[topic] == RVIZ_TYPES[kind]
+        shown[kind] = topic
+    assert shown == {
+        "MarkerArray": "/markers",
+        "PoseWithCovariance": "/pose_with_covariance",
+        "PointStamped": "/target",
+        "Image": "/overlay",
+        "PublishPoint": "/target",
+    }
+    assert "rviz_default_plugins/TF" in [display["Class"] for display in RVIZ["Displays"]]
+
+
+def test_rviz_asks_for_no_more_than_is_offered(node, client):
+    for part in rviz_parts():
+        topic = part["Topic"]
+        for offered in client.node.get_publishers_info_by_topic(topic["Value"]):
+            best_effort = offered.qos_profile.reliability == QoSReliabilityPolicy.BEST_EFFORT
+            assert topic["Reliability Policy"] == "Best Effort" or not best_effort
+            volatile = offered.qos_profile.durability == QoSDurabilityPolicy.VOLATILE
+            assert topic["Durability Policy"] == "Volatile" or not volatile
+
+
+def test_fixed_frame_is_that_of_the_simulated_scanner():
+    entries: dict[str, Entry] = {entry.name: entry for entry in entries_of(SimulationSettings)}
+    assert RVIZ["Global Options"]["Fixed Frame"] == entries["frame_id"].default
+    (scene,) = panels("3D")
+    assert scene["followTf"] == entries["frame_id"].default
+    (status,) = panels("DiagnosticStatusPanel")
+    assert status["selectedHardwareId"] == entries["frame_id"].default
+
+
+def test_foxglove_shows_what_the_node_publishes(node):
+    (scene,), (image,) = panels("3D"), panels("Image")
+    assert {"/markers", "/pose_with_covariance"} <= set(scene["topics"])
+    assert set(scene["topics"]) <= set(node.published) | set(node.subscribed)
+    assert node.subscribed[scene["publish"]["pointTopic"]] == "geometry_msgs/msg/PointStamped"
+    assert node.published[image["imageMode"]["imageTopic"]] == "sensor_msgs/msg/Image"
+    for panel in [*panels("DiagnosticStatusPanel"), *panels("DiagnosticSummary")]:
+        assert node.published[panel["topicToRender"]] == DIAGNOSTICS
+    (status,) = panels("DiagnosticStatusPanel")
+    assert status["selectedName"] == STATUS_NAME
+
+
+def test_foxglove_plots_keys_of_the_diagnostics(node):
+    plotted = set()
+    for plot in panels("Plot"):
+        for path in plot["paths"]:
+            found = PLOTTED.fullmatch(path["value"])
+            assert found, path["value"]
+            assert node.published[found["topic"]] == DIAGNOSTICS
+            assert found["name"] == STATUS_NAME
+            assert found["key"] in DIAGNOSTIC_KEYS
+            plotted.add(found["key"])
+    assert {"residual_rms_mm", "inliers"} <= plotted
+
+
+def test_foxglove_button_calls_a_service_of_the_node(node):
+    (button,) = panels("CallService")
+    assert button["serviceName"] == "/register_node/recalibrate"
+    assert node.services[button["serviceName"]] == "std_srvs/srv/Trigger"
+    assert json.loads(button["requestPayload"]) == {}
+
+
+def test_foxglove_places_every_panel_once():
+    def places(layout: Any) -> list[str]:
+        if isinstance(layout, str):
+            return [layout]
+        return places(layout["first"]) + places(layout["second"])
+
+    assert sorted(places(FOXGLOVE["layout"])) == sorted(FOXGLOVE["configById"])

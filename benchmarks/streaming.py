@@ -1,0 +1,285 @@
+"""`python -m benchmarks.streaming`: slices over DDS at a steady rate; scanner, node and listener are processes.
+
+512 x 512 pixels, six rods and 24 false spots. Latency is from an image's stamp, taken just before it is published, to
+the arrival of its pose here. CPU is of the node alone, 100 % being one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+import psutil
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from tqdm import tqdm
+
+from benchmarks.slice_source import SCANNER, WARM_UP
+from benchmarks.yardstick import Yardstick
+from stereoreg_ros.nodes.diagnostic_status import NAME
+
+P50_Y, P99_Y = 8.0, 30.0
+RATE_HZ, FAST_HZ = 10.0, 30.0
+_DEEP: Final = QoSProfile(depth=1000)
+_READY: Final = "ready, frame"
+_DEADLINE_S: Final = 60.0
+_SILENCE_S: Final = 10.0
+_MIB: Final = 2**20
+
+
+@dataclass(frozen=True)
+class Load:
+    """What the node took of the machine over some time: CPU in % of a core, and its largest resident memory in MiB."""
+
+    cpu_percent: float
+    memory_mib: float
+
+
+@dataclass
+class Stream:
+    """What became of the slices sent at one rate; times in s, by slice in the order sent.
+
+    quarters_s: median latency of each quarter of the stream.
+    """
+
+    rate_hz: float
+    sent: int
+    answered: int
+    accepted: int
+    p50_s: float
+    p99_s: float
+    longest_s: float
+    inside_p50_s: float
+    quarters_s: list[float]
+    load: Load
+
+
+@dataclass
+class _Heard:
+    """When the answers to each stamp arrived, ns; and how long the node says it took, s."""
+
+    poses: dict[int, int] = field(default_factory=dict)
+    statuses: dict[int, int] = field(default_factory=dict)
+    inside_s: dict[int, float] = field(default_factory=dict)
+
+
+class _Listener(Node):
+    def __init__(self) -> None:
+        super().__init__("streaming_listener")
+        self.heard = _Heard()
+        self.create_subscription(PoseStamped, "pose", self._on_pose, _DEEP)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEEP)
+
+    def hears_the_node(self) -> bool:
+        """Whether both topics have a publisher."""
+        return self.count_publishers("pose") > 0 and self.count_publishers("/diagnostics") > 0
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        self.heard.poses[_nanoseconds(message)] = time.time_ns()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == NAME:
+                stamp = _nanoseconds(message)
+                self.heard.statuses[stamp] = time.time_ns()
+                values = {pair.key: pair.value for pair in status.values}
+                self.heard.inside_s[stamp] = 1e-3 * float(values["duration_ms"])
+
+
+def _nanoseconds(message: PoseStamped | DiagnosticArray) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+class _RegisterNode:
+    """register_node as a process of its own; `ready_s`: from its start until it said that it was ready."""
+
+    def __init__(self, log: IO[bytes]) -> None:
+        scale = SCANNER.scale
+        self._log = log
+        begun = time.monotonic()
+        command = [sys.executable, "-m", "stereoreg_ros.nodes.register_node"]
+        command += ["--ros-args", "-p", f"pixel_spacing:=[{scale.sx}, {scale.sy}]"]
+        self._popen = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        while _READY not in self.output:
+            if self._popen.poll() is not None or time.monotonic() > begun + _DEADLINE_S:
+                raise RuntimeError(f"register_node did not become ready:\n{self.output}")
+            time.sleep(0.01)
+        self.ready_s = time.monotonic() - begun
+        self.process = psutil.Process(self._popen.pid)
+
+    @property
+    def output(self) -> str:
+        descriptor = self._log.fileno()
+        return os.pread(descriptor, os.fstat(descriptor).st_size, 0).decode(errors="replace")
+
+    def end(self) -> None:
+        self._popen.send_signal(signal.SIGINT)
+        try:
+            self._popen.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            self._popen.wait()
+
+
+class _LoadMeter:
+    """The load of a process from now on."""
+
+    def __init__(self, process: psutil.Process) -> None:
+        self._process = process
+        self._start = self._used(), time.monotonic()
+        self._largest = 0
+
+    def load(self) -> Load:
+        """Until now; memory is the most that was seen at any call."""
+        self._largest = max(self._largest, self._process.memory_info().rss)
+        used, begun = self._start
+        return Load(100 * (self._used() - used) / (time.monotonic() - begun), self._largest / _MIB)
+
+    def _used(self) -> float:
+        times = self._process.cpu_times()
+        return float(times.user + times.system)
+
+
+def _spin(listener: Node, until: Callable[[], bool], seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while not until():
+        if time.monotonic() > deadline:
+            return False
+        rclpy.spin_once(listener, timeout_sec=0.1)
+    return True
+
+
+def _stream(listener: _Listener, node: _RegisterNode, rate: float, slices: int) -> Stream:
+    command = [sys.executable, "-m", "benchmarks.slice_source", "--rate", str(rate), "--slices", str(slices)]
+    heard = listener.heard = _Heard()
+    source = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert source.stdout is not None
+    # Until the slices begin, the source is drawing them.
+    _spin(listener, lambda: bool(heard.statuses) or source.poll() is not None, _DEADLINE_S)
+    meter = _LoadMeter(node.process)
+    answered, last_s, load = 0, time.monotonic(), meter.load()
+    stamps: list[int] = []
+    with tqdm(total=WARM_UP + slices, desc=f"{rate:g} Hz", unit="slice", disable=None, leave=False) as bar:
+        while not stamps or not heard.statuses.keys() >= set(stamps):
+            rclpy.spin_once(listener, timeout_sec=0.1)
+            if len(heard.statuses) > answered:
+                answered, last_s, load = len(heard.statuses), time.monotonic(), meter.load()
+                bar.update(answered - bar.n)
+            elif stamps and time.monotonic() > last_s + _SILENCE_S:
+                break
+            if not stamps and source.poll() is not None:
+                stamps = [int(line) for line in source.stdout.read().split()]
+                if source.returncode or not stamps:
+                    raise RuntimeError(f"the slice source ended with exit code {source.returncode}")
+    # The pose of the last slice may come after its status.
+    _spin(listener, lambda: stamps[-1] in heard.poses, 1.0)
+    latencies = np.array([1e-9 * (heard.poses[stamp] - stamp) for stamp in stamps if stamp in heard.poses])
+    if latencies.size < 8:
+        raise RuntimeError(f"only {latencies.size} of {len(stamps)} slices gave a pose:\n{node.output}")
+    return Stream(
+        rate_hz=rate,
+        sent=len(stamps),
+        answered=sum(stamp in heard.statuses for stamp in stamps),
+        accepted=latencies.size,
+        p50_s=float(np.median(latencies)),
+        p99_s=float(np.percentile(latencies, 99)),
+        longest_s=float(latencies.max()),
+        inside_p50_s=float(np.median([heard.inside_s[stamp] for stamp in stamps if stamp in heard.inside_s])),
+        quarters_s=[float(np.median(part)) for part in np.array_split(latencies, 4)],
+        load=load,
+    )
+
+
+def _grows(stream: Stream) -> bool:
+    """Whether slices queue: the last quarter waits longer than the first by more than half of it and a period."""
+    first, last = stream.quarters_s[0], stream.quarters_s[-1]
+    return last > 1.5 * first + 1.0 / stream.rate_hz
+
+
+def _print(stream: Stream, unit: float) -> None:
+    quarters = " ".join(f"{1e3 * value:.1f}" for value in stream.quarters_s)
+    print(f"{stream.rate_hz:g} Hz: {stream.sent} sent, {stream.answered} answered, {stream.accepted} accepted")
+    for name, value in (("p50", stream.p50_s), ("p99", stream.p99_s), ("longest", stream.longest_s)):
+        print(f"  image to pose, {name:8s} {1e3 * value:7.1f} ms = {value / unit:6.1f} Y")
+    print(f"  median by quarters of the stream: {quarters} ms; within the node: {1e3 * stream.inside_p50_s:.1f} ms")
+    print(f"  CPU {stream.load.cpu_percent:.0f} %, memory {stream.load.memory_mib:.0f} MiB", flush=True)
+
+
+def main() -> int:
+    """Print the figures, write them as JSON; 1 where one is not what it has to be."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.streaming", description=__doc__)
+    parser.add_argument("--slices", type=int, default=1000, help="slices at each rate (default 1000)")
+    parser.add_argument(
+        "--idle", type=float, default=20.0, help="seconds for which the idle node is watched (default 20)"
+    )
+    parser.add_argument("--output", type=Path, default=Path("build/streaming.json"), help="JSON file to write")
+    arguments = parser.parse_args()
+    if arguments.slices < 8:
+        parser.error(f"--slices is {arguments.slices}, expected 8 or more")
+    # Nobody else is heard or disturbed.
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    unit = Yardstick().unit()
+    print(f"Y = {1e3 * unit:.2f} ms: threshold and connected components of a 512 x 512 slice")
+    rclpy.init()
+    listener = _Listener()
+    with tempfile.TemporaryFile() as log:
+        node = _RegisterNode(log)
+        try:
+            if not _spin(listener, listener.hears_the_node, _DEADLINE_S):
+                raise RuntimeError(f"register_node was not discovered within {_DEADLINE_S:g} s")
+            meter = _LoadMeter(node.process)
+            _spin(listener, lambda: False, arguments.idle)
+            idle = meter.load()
+            print(
+                f"from start to ready {node.ready_s:.1f} s; idle: CPU {idle.cpu_percent:.1f} %, "
+                f"memory {idle.memory_mib:.0f} MiB",
+                flush=True,
+            )
+            streams = []
+            for rate in (RATE_HZ, FAST_HZ):
+                streams.append(_stream(listener, node, rate, arguments.slices))
+                _print(streams[-1], unit)
+        finally:
+            node.end()
+            listener.destroy_node()
+            rclpy.shutdown()
+    record = {
+        "yardstick_s": unit,
+        "ready_s": node.ready_s,
+        "idle": asdict(idle),
+        "streams": [asdict(stream) for stream in streams],
+    }
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    arguments.output.write_text(json.dumps(record, indent=1) + "\n")
+    print(f"as JSON: {arguments.output}")
+    slow, fast = streams
+    missed = []
+    if slow.answered < slow.sent:
+        missed.append(f"{slow.sent - slow.answered} slices lost at {slow.rate_hz:g} Hz")
+    if slow.p50_s > P50_Y * unit:
+        missed.append(f"p50 above {P50_Y:g} Y")
+    if slow.p99_s > P99_Y * unit:
+        missed.append(f"p99 above {P99_Y:g} Y")
+    if _grows(fast):
+        missed.append(f"the delay grows at {fast.rate_hz:g} Hz")
+    print(f"FAILED: {'; '.join(missed)}" if missed else "all as it has to be")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
