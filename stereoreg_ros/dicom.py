@@ -322,6 +322,8 @@ def _without_unused_bits(stored: NDArray[Any], bits: int, signed: bool) -> NDArr
     unused = 8 * stored.dtype.itemsize - bits
     if unused <= 0:
         return stored
+    # Values of a big-endian file keep that order; looked at as other integers, they would be other values.
+    stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
     integer = stored.view(np.dtype(f"{'i' if signed else 'u'}{stored.dtype.itemsize}"))
     clean: NDArray[Any] = (integer << unused) >> unused
     return clean

@@ -61,7 +61,10 @@ def write_slice(path: Path, stored: ArrayLike, z: float = 0.0, **elements: Any) 
     meta.MediaStorageSOPClassUID = values.get("SOPClassUID", CTImageStorage)
     meta.MediaStorageSOPInstanceUID = values["SOPInstanceUID"]
     meta.TransferSyntaxUID = values.pop("TransferSyntaxUID", ExplicitVRLittleEndian)
-    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    little_endian = meta.TransferSyntaxUID.is_little_endian
+    dataset = FileDataset(
+        str(path), {}, file_meta=meta, preamble=b"\0" * 128, is_implicit_VR=False, is_little_endian=little_endian
+    )
     for keyword, value in values.items():
         setattr(dataset, keyword, value)
     _save(dataset, path)
@@ -69,10 +72,8 @@ def write_slice(path: Path, stored: ArrayLike, z: float = 0.0, **elements: Any) 
 
 
 def _save(dataset: FileDataset, path: Path) -> None:
-    # pydicom 3 renamed the argument, and deprecates the attributes that pydicom 2 needs.
+    # pydicom 3 renamed the argument.
     if "enforce_file_format" in inspect.signature(dataset.save_as).parameters:
         dataset.save_as(path, enforce_file_format=True)
     else:
-        dataset.is_little_endian = True
-        dataset.is_implicit_VR = False
         dataset.save_as(path, write_like_original=False)
