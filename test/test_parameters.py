@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from stereoreg_ros.nodes import reception_parameters
 from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
 from stereoreg_ros.options import MATCHERS, RegistrationOptions
 
-CONFIG = Path(__file__).resolve().parent.parent / "config" / "register_node.yaml"
+CONFIG = Path(__file__).resolve().parent.parent / "config"
 DEFAULTS = {entry.name: entry.default for entry in ENTRIES}
 
 CONTRACT = {
@@ -40,7 +41,7 @@ def test_table_holds_the_contract_and_every_option():
     assert len(DEFAULTS) == len(ENTRIES)
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
+@pytest.mark.parametrize("entry", [*ENTRIES, *reception_parameters.ENTRIES], ids=lambda entry: entry.name)
 def test_descriptor(entry):
     descriptor = entry.descriptor
     assert descriptor.description == entry.description != ""
@@ -50,18 +51,23 @@ def test_descriptor(entry):
     elif isinstance(entry.default, int) and not isinstance(entry.default, bool):
         (bounds,) = descriptor.integer_range
         assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0)
+    elif entry.default == ():
+        assert (descriptor.dynamic_typing, descriptor.additional_constraints) == (True, "a list of names")
     elif isinstance(entry.default, tuple):
         assert descriptor.additional_constraints == f"{len(entry.default)} numbers"
 
 
-def test_shipped_file_equals_the_defaults_and_explains_them():
-    text = CONFIG.read_text(encoding="utf-8")
-    values = yaml.safe_load(text)["/**/register_node"]["ros__parameters"]
-    assert values == {entry.name: entry.value for entry in ENTRIES}
-    assert list(values) == list(DEFAULTS)
-    assert {name: type(value) for name, value in values.items()} == {e.name: type(e.value) for e in ENTRIES}
+@pytest.mark.parametrize(
+    ("node", "entries"), [("register_node", ENTRIES), ("receive_dicom_node", reception_parameters.ENTRIES)]
+)
+def test_shipped_file_equals_the_defaults_and_explains_them(node, entries):
+    text = (CONFIG / f"{node}.yaml").read_text(encoding="utf-8")
+    values = yaml.safe_load(text)[f"/**/{node}"]["ros__parameters"]
+    assert values == {entry.name: entry.value for entry in entries}
+    assert list(values) == [entry.name for entry in entries]
+    assert {name: type(value) for name, value in values.items()} == {e.name: type(e.value) for e in entries}
     lines = [line.strip() for line in text.splitlines()]
-    for entry in ENTRIES:
+    for entry in entries:
         (number,) = (n for n, line in enumerate(lines) if line.startswith(f"{entry.name}:"))
         bounds = f"; from {entry.low:g} to {entry.high:g}" if entry.low is not None else ""
         assert lines[number - 1] == f"# {entry.description}{bounds}"

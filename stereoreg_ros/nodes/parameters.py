@@ -45,7 +45,11 @@ class Entry:
         if self.word is not None:
             descriptor.dynamic_typing = True
             descriptor.additional_constraints = f"a number, or '{self.word}'"
-        if isinstance(self.default, tuple):
+        if self.default == ():
+            # An empty list has no type of its own, so that ROS would take it for one of bytes.
+            descriptor.dynamic_typing = True
+            descriptor.additional_constraints = "a list of names"
+        elif isinstance(self.default, tuple):
             descriptor.additional_constraints = f"{len(self.default)} numbers"
         elif self.low is not None and self.high is not None:
             if isinstance(self.default, int):

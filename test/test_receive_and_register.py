@@ -1,0 +1,156 @@
+"""From the scanner's network to the pose: receiver and register_node as two processes, over DDS."""
+
+from __future__ import annotations
+
+import json
+import math
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from dicom_clients import run_dcmtk, send
+from dicom_files import CATPHAN, real, write_slice
+from real_images import CATPHAN_OPTIONS
+
+pytest.importorskip("rclpy", reason="ROS 2 is not there")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from ros_process import RosClient, node_process
+from sensor_msgs.msg import Image
+from test_receive_dicom_node import SUCCESS, port_of, receiving_process
+
+from stereoreg_ros import load_frame, register_slice
+from stereoreg_ros.dicom import read_series
+from stereoreg_ros.nodes.conversions import pose_from_message
+
+IMAGE = np.zeros((64, 64), np.uint16)
+
+
+@pytest.fixture
+def client():
+    with RosClient() as ros:
+        yield ros
+
+
+def register_process(**parameters: Any):
+    flags = [part for name, value in parameters.items() for part in ("-p", f"{name}:={json.dumps(value)}")]
+    return node_process("register_node", "--ros-args", *flags)
+
+
+class Registered:
+    """What register_node says of each image, in order."""
+
+    def __init__(self, client: RosClient) -> None:
+        self._client = client
+        self.messages = client.collect(DiagnosticArray, "/diagnostics")
+
+    def wait(self, count: int, deadline_s: float = 60.0) -> list[dict[str, str]]:
+        self._client.wait_for(lambda: len(self.messages) >= count, f"{count} answers", deadline_s)
+        return [{one.key: one.value for one in message.status[0].values} for message in self.messages]
+
+
+@contextmanager
+def both(client: RosClient, **parameters: Any):
+    """register_node and the receiver; gives what the first says, and the port of the second."""
+    with register_process(**parameters), receiving_process(register_node="register_node") as process:
+        registered = Registered(client)
+        yield registered, port_of(process, client)
+
+
+def test_storescu_sends_the_real_catphan_and_the_poses_are_those_of_the_offline_tool(client):
+    series = read_series(real(CATPHAN))
+    frame = load_frame("catphan_ctp404")
+    parameters = {"threshold": CATPHAN_OPTIONS.threshold, "max_rotation_deg": CATPHAN_OPTIONS.max_rotation_deg}
+    with both(client, frame_file="catphan_ctp404", **parameters) as (registered, port):
+        poses = client.collect(PoseStamped, "pose")
+        files = [header.path for header in series.headers]
+        sent = run_dcmtk("storescu", "-aec", "STEREOREG", "127.0.0.1", str(port), *files)
+        assert sent.returncode == 0, sent.stderr
+        answers = registered.wait(len(files), 300.0)
+        accepted = [message.header.stamp for message in registered.messages if is_accepted(message)]
+        client.wait_for(lambda: len(poses) >= len(accepted), "the poses")
+    assert len(answers) == len(files)
+    assert [pose.header.stamp for pose in poses] == accepted
+    published = iter(poses)
+    off_mm, off_rad = [], []
+    for one, answer in zip(series, answers, strict=True):
+        expected = register_slice(one.ct_slice, frame, CATPHAN_OPTIONS)
+        assert answer["outcome"] == ("accepted" if expected else "refused"), one.header.path
+        if not expected:
+            assert answer["reason"] == expected.reason
+            continue
+        found = pose_from_message(next(published))
+        off = expected.scanner_from_frame.inverse() @ found
+        off_mm.append(float(np.linalg.norm(off.translation)))
+        off_rad.append(float(np.abs(off.rotation - np.eye(3)).max()))
+    print(f"{len(off_mm)} poses of {len(files)} slices: at most {max(off_mm):.2g} mm and {max(off_rad):.2g} rad off")
+    assert len(off_mm) >= 9
+    assert max(off_mm) < 1e-6
+    assert max(off_rad) < 1e-6
+
+
+def is_accepted(message: DiagnosticArray) -> bool:
+    return any(one.key == "outcome" and one.value == "accepted" for one in message.status[0].values)
+
+
+def test_every_slice_is_registered_with_its_own_spacing(client, tmp_path):
+    """Also where the spacing changes while slices wait."""
+    spacings = [[0.5, 0.5]] * 3 + [[0.7, 0.4]] * 2 + [[0.5, 0.5], [0.9, 0.9], [0.5, 0.5]]
+    paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE, z, PixelSpacing=one) for z, one in enumerate(spacings)]
+    with both(client) as (registered, port):
+        assert [one.Status for one in send(port, *paths)] == [SUCCESS] * len(paths)
+        answers = registered.wait(len(paths))
+    found = [[float(one["pixel_spacing_y_mm"]), float(one["pixel_spacing_x_mm"])] for one in answers]
+    assert found == spacings
+    assert {one["reason"] for one in answers} == {"too_few_spots"}
+
+
+def test_a_burst_is_registered_slice_by_slice_and_none_is_lost(client, tmp_path):
+    paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE, z) for z in range(60)]
+    with both(client) as (registered, port):
+        images = client.collect(Image, "image")
+        assert [one.Status for one in send(port, *paths)] == [SUCCESS] * len(paths)
+        registered.wait(len(paths))
+        client.wait_for(lambda: len(images) >= len(paths), "the images")
+    assert [message.header.stamp for message in registered.messages] == [image.header.stamp for image in images]
+
+
+def test_slices_wait_for_register_node_and_for_the_one_that_takes_its_place(client, tmp_path):
+    paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE, z, PixelSpacing=[0.6, 0.3]) for z in range(6)]
+    with receiving_process(register_node="register_node") as process:
+        port = port_of(process, client)
+        assert [one.Status for one in send(port, *paths[:2])] == [SUCCESS] * 2
+        client.wait_for(lambda: "waiting for the parameter service" in process.output, "the receiver to wait")
+        with register_process():
+            registered = Registered(client)
+            registered.wait(2)
+        assert [one.Status for one in send(port, *paths[2:4])] == [SUCCESS] * 2
+        with register_process():
+            answers = registered.wait(4)
+            assert send(port, *paths[4:])[1].Status == SUCCESS
+            answers = registered.wait(6)
+    assert {(one["pixel_spacing_x_mm"], one["pixel_spacing_y_mm"]) for one in answers} == {("0.3", "0.6")}
+
+
+def test_a_register_node_that_was_killed_unnoticed_is_told_anew_and_sent_the_slice_again(client, tmp_path):
+    """DDS goes on counting a killed process for a while: its successor knows no spacing, and says so."""
+    first, second = (write_slice(tmp_path / f"{z}.dcm", IMAGE, z, PixelSpacing=[0.6, 0.3]) for z in range(2))
+    with receiving_process(register_node="register_node") as process:
+        port = port_of(process, client)
+        with register_process() as killed:
+            registered = Registered(client)
+            assert send(port, first)[0].Status == SUCCESS
+            registered.wait(1)
+            killed.kill()
+        with register_process():
+            assert send(port, second)[0].Status == SUCCESS
+
+            def told() -> bool:
+                return any(float(one["pixel_spacing_x_mm"]) == 0.3 for one in registered.wait(1)[1:])
+
+            client.wait_for(told, "an answer with the right spacing", 90.0)
+    stamps = {(one.header.stamp.sec, one.header.stamp.nanosec) for one in registered.messages[1:]}
+    assert len(stamps) == 1
+    assert math.isfinite(float(registered.wait(1)[-1]["duration_ms"]))
