@@ -28,11 +28,13 @@ from pydicom.uid import (
     DeflatedExplicitVRLittleEndian,
     EnhancedCTImageStorage,
     ExplicitVRLittleEndian,
+    RLELossless,
 )
 
+from stereoreg_ros.codestream import CodestreamSize, size_of
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.multiframe import single_frames
+from stereoreg_ros.multiframe import single_frame, single_frames
 
 MAX_SIDE_PX: Final = 8192
 
@@ -190,7 +192,24 @@ def _read_placed(name: Path, dataset: pydicom.Dataset) -> DicomSlice:
     is_ct = _value(name, dataset, "SOPClassUID") in (CTImageStorage, EnhancedCTImageStorage)
     if is_ct and _value(name, dataset, "RescaleSlope") is None:
         raise _fault(name, "RescaleSlope", None, "that of a CT image")
+    _require_codestream_size(header, dataset)
     return DicomSlice(header, Slice(_read_hu(header, dataset), header.scale, header.scanner_from_slice))
+
+
+def _require_codestream_size(header: SliceHeader, dataset: pydicom.Dataset) -> None:
+    """A decoder goes by what the compressed image says, whatever the object says."""
+    with _pydicom(header.path, f"{_tag('TransferSyntaxUID')} cannot be read"):
+        syntax = UID(str(dataset.file_meta.TransferSyntaxUID))
+        if not syntax.is_encapsulated or syntax == RLELossless:
+            return
+    with _pydicom(header.path, f"{_tag('PixelData')} cannot be decoded"):
+        size = size_of(single_frame(dataset))
+    if size != CodestreamSize(header.rows, header.columns, 1):
+        raise DicomError(
+            header.path,
+            f"{_tag('PixelData')} holds an image of {size}, expected {header.rows} rows, "
+            f"{header.columns} columns and one component",
+        )
 
 
 def _require_decoded_size(name: Path, dataset: pydicom.Dataset, max_bytes: int) -> None:

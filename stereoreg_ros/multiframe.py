@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Final
 
-import pydicom
 from pydicom import encaps
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import UID
@@ -58,6 +57,13 @@ def single_frames(dataset: Dataset) -> list[Dataset]:
     return frames
 
 
+def single_frame(dataset: Dataset) -> bytes:
+    """The compressed image of a data set that holds one; ValueError, or what pydicom raises, where it holds none."""
+    for frame in _encapsulated(dataset.PixelData, 1):
+        return frame
+    raise ValueError("found no compressed image")
+
+
 def _only_item(dataset: Dataset, keyword: str) -> Dataset | None:
     items: Any = dataset.get(keyword)
     if not items:
@@ -76,6 +82,13 @@ def _pixels(dataset: Dataset, count: int, syntax: UID) -> Iterator[bytes]:
         if len(data) < count * size:
             raise ValueError(f"found {len(data)} bytes of Pixel Data (7FE0,0010), expected {count} * {size}")
         return (data[number * size : (number + 1) * size] for number in range(count))
-    if int(pydicom.__version__.split(".")[0]) >= 3:
-        return (encaps.encapsulate([frame]) for frame in encaps.generate_frames(data, number_of_frames=count))
-    return (encaps.encapsulate([frame]) for frame in encaps.generate_pixel_data_frame(data, count))
+    return (encaps.encapsulate([frame]) for frame in _encapsulated(data, count))
+
+
+def _encapsulated(data: bytes, count: int) -> Iterator[bytes]:
+    # pydicom 3 renamed it.
+    generate: Any = getattr(encaps, "generate_frames", None)
+    frames: Iterator[bytes] = (
+        generate(data, number_of_frames=count) if generate else encaps.generate_pixel_data_frame(data, count)
+    )
+    return frames

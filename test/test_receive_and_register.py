@@ -19,7 +19,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from ros_process import RosClient, node_process
 from sensor_msgs.msg import Image
-from test_receive_dicom_node import SUCCESS, port_of, receiving_process
+from test_play_dicom_node import pixels
+from test_receive_dicom_node import SUCCESS, port_of, receiving_process, seconds
 
 from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.dicom import read_series
@@ -118,20 +119,30 @@ def test_a_burst_is_registered_slice_by_slice_and_none_is_lost(client, tmp_path)
 
 
 def test_slices_wait_for_register_node_and_for_the_one_that_takes_its_place(client, tmp_path):
-    paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE, z, PixelSpacing=[0.6, 0.3]) for z in range(6)]
+    paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE + z, z, PixelSpacing=[0.6, 0.3]) for z in range(6)]
     with receiving_process(register_node="register_node") as process:
         port = port_of(process, client)
+        images = client.collect(Image, "image")
+
+        def wait_for_slices(count: int) -> None:
+            # All but the last were answered. One that was sent twice bears the same stamp.
+            client.wait_for(lambda: len({seconds(image.header) for image in images}) >= count, f"{count} slices", 60.0)
+
         assert [one.Status for one in send(port, *paths[:2])] == [SUCCESS] * 2
         client.wait_for(lambda: "waiting for the parameter service" in process.output, "the receiver to wait")
+        assert not images
         with register_process():
-            registered = Registered(client)
-            registered.wait(2)
+            wait_for_slices(2)
         assert [one.Status for one in send(port, *paths[2:4])] == [SUCCESS] * 2
         with register_process():
-            answers = registered.wait(4)
-            assert send(port, *paths[4:])[1].Status == SUCCESS
-            answers = registered.wait(6)
-    assert {(one["pixel_spacing_x_mm"], one["pixel_spacing_y_mm"]) for one in answers} == {("0.3", "0.6")}
+            wait_for_slices(4)
+            registered = Registered(client)
+            assert [one.Status for one in send(port, *paths[4:])] == [SUCCESS] * 2
+            wait_for_slices(6)
+            answer = registered.wait(1)[-1]
+    in_order = list(dict.fromkeys(int(pixels(image)[0, 0]) + 1024 for image in images))
+    assert in_order == list(range(6))
+    assert (answer["pixel_spacing_x_mm"], answer["pixel_spacing_y_mm"]) == ("0.3", "0.6")
 
 
 def test_a_register_node_that_was_killed_unnoticed_is_told_anew_and_sent_the_slice_again(client, tmp_path):

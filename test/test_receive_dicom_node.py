@@ -18,7 +18,7 @@ from pydicom.uid import CTImageStorage, RTStructureSetStorage
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from geometry_msgs.msg import PoseStamped
-from ros_process import NodeProcess, RosClient, node_process
+from ros_process import REPOSITORY, NodeProcess, RosClient, node_process
 from sensor_msgs.msg import Image
 from test_play_dicom_node import pixels, play
 
@@ -370,3 +370,26 @@ def test_it_does_not_start_where_another_listens(broken_slices):
     with receiving_process(port=broken_slices.port) as process:
         assert process.wait() == 1
         assert f"cannot listen at 127.0.0.1 port {broken_slices.port}" in process.output
+
+
+def test_the_shipped_parameter_file_starts_it(client, tmp_path):
+    text = (REPOSITORY / "config" / "receive_dicom_node.yaml").read_text(encoding="utf-8")
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text.replace("port: 11112", "port: 0"), encoding="utf-8")
+    with node_process("receive_dicom_node", "--ros-args", "--params-file", str(file)) as process:
+        assert echo(port_of(process, client)) == SUCCESS
+
+
+def test_files_of_a_watched_folder_come_out_beside_those_of_the_network(client, tmp_path):
+    folder = tmp_path / "export"
+    folder.mkdir()
+    write_slice(folder / "old.dcm", IMAGE)
+    with receiver(client, watch_folder=str(folder), watch_period=0.1) as received:
+        write_slice(folder / "new.part", IMAGE + 5).rename(folder / "new.dcm")
+        received.wait(1)
+        write_slice(folder / "broken.dcm", IMAGE, PixelSpacing=None)
+        received.wait_for_log("broken.dcm: Pixel Spacing (0028,0030) is missing")
+        assert send(received.port, write_slice(tmp_path / "sent.dcm", IMAGE + 6))[0].Status == SUCCESS
+        images = received.wait(2)
+        assert received.process.output.count("broken.dcm") == 1
+    assert [pixels(image)[0, 0] + 1024 for image in images] == [5, 6]
