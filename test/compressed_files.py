@@ -10,6 +10,8 @@ import pytest
 from dicom_clients import run_dcmtk
 from pydicom import uid
 
+from stereoreg_ros.reception.transfer_syntaxes import JPEG_LOSSLESS
+
 
 @dataclass(frozen=True)
 class Syntax:
@@ -30,7 +32,7 @@ SYNTAXES = [
     Syntax(uid.DeflatedExplicitVRLittleEndian, maker=("dcmconv", "+td")),
     Syntax(uid.RLELossless),
     Syntax(uid.JPEGLosslessSV1, maker=("dcmcjpeg", "+e1")),
-    Syntax(uid.JPEGLossless, maker=("dcmcjpeg", "+el")),
+    Syntax(JPEG_LOSSLESS, maker=("dcmcjpeg", "+el")),
     Syntax(uid.JPEGLSLossless),
     Syntax(uid.JPEG2000Lossless),
     Syntax(uid.JPEGLSNearLossless, loss=2, maker=("dcmcjpls", "+en", "+md", "2")),

@@ -11,6 +11,7 @@ import yaml
 
 from stereoreg_ros.nodes import reception_parameters
 from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
+from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
 from stereoreg_ros.options import MATCHERS, RegistrationOptions
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
@@ -109,6 +110,33 @@ def test_values_reach_their_places():
 def test_faulty_value_is_named(name, value, sentence):
     with pytest.raises(ValueError, match=sentence):
         NodeSettings.from_parameters({**DEFAULTS, name: value})
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"ae_title": ""}, "ae_title: found '', expected an AE title of 1 to 16 characters"),
+        ({"ae_title": " CT"}, "ae_title: found ' CT', expected an AE title"),
+        ({"ae_title": "Ü"}, "ae_title: found 'Ü', expected an AE title of printable ASCII"),
+        ({"ae_title": "A TITLE TOO LONG."}, "ae_title: .*, expected an AE title of 1 to 16 characters"),
+        ({"allowed_callers": ("CT1", "CT\\2")}, "allowed_callers: found .*, expected an AE title"),
+        ({"allowed_callers": (1, 2)}, "allowed_callers: found 1, expected an AE title"),
+        ({"allowed_callers": "CT1"}, "allowed_callers is 'CT1', expected a list of AE titles"),
+        ({"tls_key": "key.pem"}, "one of tls_certificate and tls_key is empty, expected both or neither"),
+        ({"tls_certificate": "host.pem"}, "one of tls_certificate and tls_key is empty, expected both or neither"),
+        ({"tls_client_ca": "ca.pem"}, "tls_client_ca is set without tls_certificate, expected both"),
+        ({"watch_folder": "/nowhere"}, "watch_folder is '/nowhere', expected a folder"),
+        ({"watch_folder": "/", "keep_folder": "/kept"}, "keep_folder /kept lies in watch_folder /"),
+        ({"watch_folder": "/", "keep_folder": "/"}, "every slice would come twice"),
+    ],
+)
+def test_faulty_value_of_the_receiver_is_named(values, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        ReceptionSettings(**values)
+
+
+def test_the_receiver_tells_clients_their_limits_in_bytes():
+    assert ReceptionSettings(max_object_mb=3, allowed_callers=("CT1", "CT2")).limits.max_object_bytes == 3 * 2**20
 
 
 @pytest.mark.parametrize("matcher", MATCHERS)

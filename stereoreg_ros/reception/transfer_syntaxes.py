@@ -8,6 +8,8 @@ import pydicom
 from pydicom import uid
 from pydicom.uid import UID
 
+# Process 14 with any predictor; pydicom 2 and 3 do not mean the same by the name JPEGLossless.
+JPEG_LOSSLESS: Final = UID("1.2.840.10008.1.2.4.57")
 _ALWAYS: Final = (
     uid.ExplicitVRLittleEndian,
     uid.ImplicitVRLittleEndian,
@@ -17,7 +19,7 @@ _ALWAYS: Final = (
 _COMPRESSED: Final = (
     uid.RLELossless,
     uid.JPEGLosslessSV1,
-    uid.JPEGLossless,
+    JPEG_LOSSLESS,
     uid.JPEGLSLossless,
     uid.JPEG2000Lossless,
     uid.JPEGBaseline8Bit,
