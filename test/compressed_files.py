@@ -49,12 +49,11 @@ def convert(path: Path, syntax: Syntax) -> Path:
         assert made.returncode == 0, made.stderr
         return converted
     dataset = pydicom.dcmread(path)
-    compress = getattr(dataset, "compress", None)
-    if compress is None:
-        pytest.skip(f"pydicom {pydicom.__version__} cannot write {syntax.uid.name}")
+    # pydicom 2 has no such argument, and knows fewer encoders.
+    named = {"generate_instance_uid": False} if int(pydicom.__version__.split(".")[0]) >= 3 else {}
     try:
-        compress(syntax.uid, generate_instance_uid=False)
-    except (NotImplementedError, ValueError) as error:
+        dataset.compress(syntax.uid, **named)
+    except NotImplementedError as error:
         pytest.skip(f"pydicom {pydicom.__version__} cannot write {syntax.uid.name}: {error}")
     dataset.save_as(converted)
     return converted

@@ -50,8 +50,13 @@ def association(
     caller: str = "SCANNER",
     called: str = TITLE,
     tls: ssl.SSLContext | None = None,
+    sent: list[bytes] | None = None,
 ) -> Iterator[Association]:
-    """An association, established or not, with the presentation contexts (SOP class, transfer syntaxes)."""
+    """An association, established or not, with the presentation contexts (SOP class, transfer syntaxes).
+
+    sent: takes every PDU that goes to the receiver.
+    """
+    pdus = sent if sent is not None else []
     client = entity(caller)
     client.add_requested_context(Verification)
     for sop_class, syntaxes in contexts:
@@ -62,7 +67,10 @@ def association(
         port,
         ae_title=called,
         tls_args=(tls, "localhost") if tls else None,
-        evt_handlers=[(evt.EVT_CONN_OPEN, lambda event: sockets.append(event.assoc.dul.socket.socket))],
+        evt_handlers=[
+            (evt.EVT_CONN_OPEN, lambda event: sockets.append(event.assoc.dul.socket.socket)),
+            (evt.EVT_DATA_SENT, lambda event: pdus.append(event.data)),
+        ],
     )
     try:
         yield opened

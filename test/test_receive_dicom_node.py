@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
+import socket
 import time
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pydicom
 import pytest
 from dicom_clients import association, connect, echo, run_dcmtk, send
 from dicom_files import write_slice
@@ -386,3 +390,30 @@ def test_files_of_a_watched_folder_come_out_beside_those_of_the_network(client, 
         images = received.wait(2)
         assert received.process.output.count("broken.dcm") == 1
     assert [pixels(image)[0, 0] + 1024 for image in images] == [5, 6]
+
+
+def test_sessions_with_flipped_bytes_leave_it_serving(client, tmp_path):
+    """What a client sends from the first byte to the last, spoilt here and there, on connections of their own."""
+    path = write_slice(tmp_path / "a.dcm", IMAGE)
+    rng = np.random.default_rng(17)
+    with receiver(client, association_timeout=1.0, network_timeout=1.0) as received:
+        session = recorded_session(received.port, path)
+        for _ in range(150):
+            spoilt = np.frombuffer(session, np.uint8).copy()
+            spoilt[rng.integers(0, len(spoilt), rng.integers(1, 8))] = rng.integers(0, 256)
+            with connect(received.port) as connection, contextlib.suppress(ConnectionError):
+                connection.sendall(spoilt.tobytes())
+                connection.shutdown(socket.SHUT_WR)
+                assert hung_up(connection)
+        client.wait_for(lambda: echo(received.port) == SUCCESS, "a place")
+        assert send(received.port, path)[0].Status == SUCCESS
+        assert "Traceback" not in received.process.output
+
+
+def recorded_session(port: int, path: Path) -> bytes:
+    """Everything that a client sends to ask for an association, store a file and release."""
+    sent: list[bytes] = []
+    dataset = pydicom.dcmread(path)
+    with association(port, [(CTImageStorage, dataset.file_meta.TransferSyntaxUID)], sent=sent) as opened:
+        assert opened.send_c_store(dataset).Status == SUCCESS
+    return b"".join(sent)

@@ -18,12 +18,14 @@ from pynetdicom.presentation import PresentationContext
 from pynetdicom.transport import AssociationServer, RequestHandler
 
 from stereoreg_ros.reception.bounded_socket import BoundedSocket, Limits, describe
+from stereoreg_ros.reception.ending_state_machine import EndingStateMachine
 
 # Connections beyond the allowed associations: those that have not asked for one yet, or learn why they get none.
 # Each takes two threads, which look for something to do a thousand times a second.
 SPARE_CONNECTIONS: Final = 8
 # Rejected for now, by the provider's presentation layer: PS3.8 9.3.4.
 _LOCAL_LIMIT_EXCEEDED: Final = (2, 3, 2)
+_ABORTED_BY_USER: Final = 0
 _POLL_S: Final = 0.1
 _FAREWELL_S: Final = 0.2
 _LOG = logging.getLogger(__name__)
@@ -39,6 +41,7 @@ class _Connection(RequestHandler):
         # The socket in place announces the connection anew; it is to be heard of once.
         association.dul.event_queue.get_nowait()
         association.dul.socket = BoundedSocket(association, self.request, self.server.limits)
+        association.dul.state_machine = EndingStateMachine(association.dul)
         # A thread that waits for a client must not keep the process from ending.
         association.dul.daemon = True
         return association
@@ -80,7 +83,7 @@ class BoundedServer(AssociationServer):
         self.server_close()
         open_associations = self.active_associations
         for association in open_associations:
-            association.abort(block=False)
+            association.acse.send_abort(_ABORTED_BY_USER)
         end_s = time.monotonic() + _FAREWELL_S
         for association in open_associations:
             # The rest have nobody who would hear of it.
