@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pydicom
 import pytest
@@ -50,7 +51,7 @@ def convert(path: Path, syntax: Syntax) -> Path:
         return converted
     dataset = pydicom.dcmread(path)
     # pydicom 2 has no such argument, and knows fewer encoders.
-    named = {"generate_instance_uid": False} if int(pydicom.__version__.split(".")[0]) >= 3 else {}
+    named: dict[str, Any] = {"generate_instance_uid": False} if int(pydicom.__version__.split(".")[0]) >= 3 else {}
     try:
         dataset.compress(syntax.uid, **named)
     except NotImplementedError as error:

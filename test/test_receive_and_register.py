@@ -15,16 +15,21 @@ from real_images import CATPHAN_OPTIONS
 
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import parameter_value_to_python
 from ros_process import RosClient, node_process
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 from test_play_dicom_node import pixels
 from test_receive_dicom_node import SUCCESS, port_of, receiving_process, seconds
 
 from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.dicom import read_series
 from stereoreg_ros.nodes.conversions import pose_from_message
+from stereoreg_ros.nodes.diagnostic_status import NAME
 
 IMAGE = np.zeros((64, 64), np.uint16)
 
@@ -165,3 +170,54 @@ def test_a_register_node_that_was_killed_unnoticed_is_told_anew_and_sent_the_sli
     stamps = {(one.header.stamp.sec, one.header.stamp.nanosec) for one in registered.messages[1:]}
     assert len(stamps) == 1
     assert math.isfinite(float(registered.wait(1)[-1]["duration_ms"]))
+
+
+class SlowRegisterNode:
+    """Stands in for register_node, and answers an image when it is told to."""
+
+    def __init__(self, client: RosClient) -> None:
+        self.spacings: list[list[float]] = []
+        self.stamps: list[Any] = []
+        self._answers = client.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        client.node.create_subscription(Image, "image", self._on_image, 10)
+        client.node.create_subscription(PoseStamped, "slice_pose", lambda pose: None, 10)
+        client.node.create_service(
+            SetParametersAtomically, "register_node/set_parameters_atomically", self._on_parameters
+        )
+
+    def _on_image(self, image: Any) -> None:
+        self.stamps.append(image.header.stamp)
+
+    def _on_parameters(self, request, response):
+        values = {one.name: parameter_value_to_python(one.value) for one in request.parameters}
+        self.spacings.append(list(values["pixel_spacing"]))
+        response.result = SetParametersResult(successful=True)
+        return response
+
+    def answer(self, number: int) -> None:
+        """Answer the image that came as the one of this number, with the spacing told last."""
+        sx, sy = self.spacings[-1]
+        values = {"calibration": "configured", "pixel_spacing_x_mm": str(sx), "pixel_spacing_y_mm": str(sy)}
+        status = DiagnosticStatus(name=NAME, values=[KeyValue(key=key, value=value) for key, value in values.items()])
+        self._answers.publish(DiagnosticArray(header=Header(stamp=self.stamps[number]), status=[status]))
+
+
+def test_no_other_spacing_is_told_while_a_copy_of_a_slice_may_still_be_registered(client, tmp_path):
+    first, second = (
+        write_slice(tmp_path / f"{z}.dcm", IMAGE, z, PixelSpacing=[spacing, spacing])
+        for z, spacing in enumerate([0.5, 0.7])
+    )
+    slow = SlowRegisterNode(client)
+    with receiving_process(register_node="register_node") as process:
+        port = port_of(process, client)
+        assert [one.Status for one in send(port, first, second)] == [SUCCESS] * 2
+        client.wait_for(lambda: len(slow.stamps) >= 2, "the first slice and its copy", 40.0)
+        assert slow.stamps[0] == slow.stamps[1]
+        slow.answer(0)
+        with pytest.raises(AssertionError, match="in vain"):
+            client.wait_for(lambda: [0.7, 0.7] in slow.spacings or len(slow.stamps) > 2, "another spacing", 3.0)
+        slow.answer(1)
+        client.wait_for(lambda: len(slow.stamps) >= 3, "the second slice")
+        assert slow.spacings[-1] == [0.7, 0.7]
+        assert slow.stamps[2] != slow.stamps[0]
+        slow.answer(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 import stereoreg_ros.reception
+from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.parameters import ParameterError
 from stereoreg_ros.nodes.reception_log import NodeLogHandler
 from stereoreg_ros.nodes.reception_parameters import ReceptionSettings, declare_reception
@@ -30,10 +32,29 @@ from stereoreg_ros.reception.watched_folder import WatchedFolder
 # A search that is given up takes ten seconds or so.
 ANSWER_S: Final = 15.0
 TRIES: Final = 3
+# By then register_node has done with every slice that it was sent, or is another process.
+SETTLED_S: Final = 60.0
 _POLL_S: Final = 0.01
 # Where nobody answers: subscribers keep the last few only, and need time to take them.
 _UNANSWERED_S: Final = 0.02
 _NS_PER_S: Final = 10**9
+
+
+@dataclass(frozen=True)
+class _Stray:
+    """A slice that was sent more often than it was answered: register_node may have it in its queue still.
+
+    until_s: when it has certainly done with it, seconds of the monotonic clock. answers: how many end that earlier.
+    """
+
+    scale: PixelScale
+    until_s: float
+    answers: int | None
+
+    def stands_in_the_way_of(self, scale: PixelScale, count: int) -> bool:
+        """Whether, told of this pixel spacing, register_node might register the stray slice with it."""
+        answered = self.answers is not None and count >= self.answers
+        return scale != self.scale and not answered and time.monotonic() < self.until_s
 
 
 class ReceiveDicomNode(Node):
@@ -55,6 +76,8 @@ class ReceiveDicomNode(Node):
         self._sent_stamp = TimeMessage()
         self._answer_by_s = 0.0
         self._tries = 0
+        self._answers_before = 0
+        self._stray: _Stray | None = None
         self._log_handler = NodeLogHandler(self)
         log = logging.getLogger(stereoreg_ros.reception.__name__)
         log.setLevel(logging.INFO)
@@ -128,6 +151,8 @@ class ReceiveDicomNode(Node):
             if not self._is_done(received):
                 return
             self._queue.remove_first()
+            if self._teller is not None and self._answers.count < self._tries:
+                self._stray = _Stray(received.dicom_slice.ct_slice.scale, time.monotonic() + SETTLED_S, self._tries)
             self._sent, self._tries = None, 0
             received = self._queue.first()
         if received is not None and self._may_publish(received):
@@ -135,14 +160,21 @@ class ReceiveDicomNode(Node):
 
     def _may_publish(self, received: ReceivedSlice) -> bool:
         """Whether somebody listens, and register_node knows this slice's pixel spacing."""
-        told = self._teller is None or self._teller.tell(received.dicom_slice.ct_slice.scale)
+        scale = received.dicom_slice.ct_slice.scale
+        if self._stray is not None and self._stray.stands_in_the_way_of(scale, self._answers.count):
+            return False
+        told = self._teller is None or self._teller.tell(scale)
         heard = self._teller is None or self._answers.can_be_heard
         return told and heard and (not self._settings.wait_for_subscriber or self._publisher.listened_to())
 
     def _publish(self, received: ReceivedSlice) -> None:
         if self._tries == 0:
             self._sent_stamp = self._stamp_of(received)
-        self._answers.expect(self._sent_stamp)
+            self._answers.expect(self._sent_stamp)
+            if self._stray is not None:
+                # Its answers are not counted any more, but it may still be registered.
+                self._stray = replace(self._stray, answers=None)
+        self._answers_before = self._answers.count
         self._publisher.publish(received.dicom_slice, self._sent_stamp)
         self._sent = received
         self._tries += 1
@@ -153,13 +185,14 @@ class ReceiveDicomNode(Node):
         overdue = time.monotonic() > self._answer_by_s
         if self._teller is None:
             return overdue
-        if self._answers.answered and self._answers.came_with(sent.dicom_slice.ct_slice.scale):
+        answered = self._answers.count > self._answers_before
+        if answered and self._answers.came_with(sent.dicom_slice.ct_slice.scale):
             return True
-        if not self._answers.answered and not overdue:
+        if not answered and not overdue:
             return False
         # Another process may have taken register_node's place, unnoticed, and was not told the spacing.
         self._teller.forget()
-        fault = "with another pixel spacing" if self._answers.answered else f"nothing within {ANSWER_S:g} s"
+        fault = "with another pixel spacing" if answered else f"nothing within {ANSWER_S:g} s"
         name = self._settings.register_node
         if self._tries < TRIES:
             self.get_logger().warning(

@@ -15,12 +15,15 @@ _SAME_SPACING = 1e-4
 
 
 class RegistrationAnswers:
-    """Listens to `/diagnostics` for the answer to one image at a time."""
+    """Listens to `/diagnostics` for the answers to one image at a time, which may have been sent more than once.
+
+    count: of its answers so far, registered or refused.
+    """
 
     def __init__(self, node: Node) -> None:
         self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _QUEUE)
         self._stamp: Time | None = None
-        self._answered = False
+        self.count = 0
         self._measured = False
         self._spacing = (0.0, 0.0)
 
@@ -30,16 +33,11 @@ class RegistrationAnswers:
         return bool(self._subscription.get_publisher_count() > 0)
 
     def expect(self, stamp: Time) -> None:
-        """Wait for the answer to the image of this stamp."""
-        self._stamp, self._answered = stamp, False
-
-    @property
-    def answered(self) -> bool:
-        """Whether the image was registered or refused."""
-        return self._answered
+        """Wait for answers to the image of this stamp."""
+        self._stamp, self.count = stamp, 0
 
     def came_with(self, scale: PixelScale) -> bool:
-        """Whether the answer rests on this pixel spacing, or on one that was measured in its place."""
+        """Whether the last answer rests on this pixel spacing, or on one that was measured in its place."""
         return self._measured or np.allclose(self._spacing, (scale.sx, scale.sy), rtol=_SAME_SPACING, atol=0.0)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -47,7 +45,7 @@ class RegistrationAnswers:
             return
         for status in message.status:
             if status.name == NAME:
-                self._answered = True
+                self.count += 1
                 values = {one.key: one.value for one in status.values}
                 self._measured = values["calibration"] == "measured"
                 self._spacing = (float(values["pixel_spacing_x_mm"]), float(values["pixel_spacing_y_mm"]))
