@@ -6,7 +6,7 @@ import logging
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.clock import Clock, ClockType
@@ -78,6 +78,7 @@ class ReceiveDicomNode(Node):
         self._tries = 0
         self._answers_before = 0
         self._stray: _Stray | None = None
+        self._waits_for = ""
         self._log_handler = NodeLogHandler(self)
         log = logging.getLogger(stereoreg_ros.reception.__name__)
         log.setLevel(logging.INFO)
@@ -163,9 +164,21 @@ class ReceiveDicomNode(Node):
         scale = received.dicom_slice.ct_slice.scale
         if self._stray is not None and self._stray.stands_in_the_way_of(scale, self._answers.count):
             return False
-        told = self._teller is None or self._teller.tell(scale)
-        heard = self._teller is None or self._answers.can_be_heard
-        return told and heard and (not self._settings.wait_for_subscriber or self._publisher.listened_to())
+        if self._teller is not None:
+            if not self._teller.tell(scale):
+                return False
+            if not self._answers.can_be_heard:
+                return self._wait_for("the diagnostics of register_node")
+        if self._settings.wait_for_subscriber and not self._publisher.listened_to():
+            return self._wait_for("a subscriber of image")
+        self._waits_for = ""
+        return True
+
+    def _wait_for(self, what: str) -> Literal[False]:
+        if self._waits_for != what:
+            self._waits_for = what
+            self.get_logger().info(f"slices wait for {what}")
+        return False
 
     def _publish(self, received: ReceivedSlice) -> None:
         if self._tries == 0:
