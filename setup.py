@@ -35,6 +35,7 @@ setup(
             "register_node = stereoreg_ros.nodes.register_node:main",
             "simulate_node = stereoreg_ros.nodes.simulate_node:main",
             "play_dicom_node = stereoreg_ros.nodes.play_dicom_node:main",
+            "receive_dicom_node = stereoreg_ros.nodes.receive_dicom_node:main",
             "demo_report = stereoreg_ros.nodes.demo_report:main",
         ],
     },

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import struct
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -16,18 +19,35 @@ import numpy as np
 import pydicom
 from numpy.typing import NDArray
 from pydicom.datadict import dictionary_description, tag_for_keyword
-from pydicom.uid import UID
+from pydicom.dataset import FileMetaDataset
+from pydicom.filereader import read_dataset
+from pydicom.filewriter import write_file_meta_info
+from pydicom.uid import (
+    UID,
+    CTImageStorage,
+    DeflatedExplicitVRLittleEndian,
+    EnhancedCTImageStorage,
+    ExplicitVRLittleEndian,
+    RLELossless,
+)
 
+from stereoreg_ros.codestream import CodestreamSize, size_of
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.multiframe import single_frame, single_frames
 
 MAX_SIDE_PX: Final = 8192
 
 _FOLDER: Final = "a folder"
+_NO_LETTERS: Final = "not a DICOM file: found no letters DICM at byte 128"
 _AXES_TOLERANCE: Final = 1e-3
 _SAME_POSITION_MM: Final = 1e-3
 _SAME_SPACING: Final = 1e-4
 _MONOCHROME: Final = ("MONOCHROME2", "MONOCHROME1")
+# Preamble and letters; then the length of the file meta information, itself an element of twelve bytes.
+_META_START: Final = 132
+_META_LENGTH: Final = struct.Struct("<8sI")
+_META_LENGTH_TAG: Final = b"\x02\x00\x00\x00UL\x04\x00"
 
 
 class DicomError(ValueError):
@@ -145,6 +165,106 @@ def read_series(path: str | os.PathLike[str], on_fault: Callable[[DicomError], N
     return DicomSeries(tuple(headers), tuple(skipped))
 
 
+def read_frames(name: Path, content: bytes, max_bytes: int) -> tuple[DicomSlice, ...]:
+    """The slices of a DICOM object in memory, in the form of a file: one, or every frame of an Enhanced CT image.
+
+    Meant for what arrives unasked, and stricter than `read_slice`: every slice must say where it lies, CT must say how
+    values become HU, and projections (localizers) are no slices. name: stands for the object in errors.
+    max_bytes: most that its data or its pixels may take when unpacked.
+    Raises DicomError.
+    """
+    if content[128:_META_START] != b"DICM":
+        raise DicomError(name, f"{_NO_LETTERS}, expected a DICOM file")
+    dataset = _parse(name, BytesIO(_inflated(name, content, max_bytes)), stop_before_pixels=False)
+    _require_decoded_size(name, dataset, max_bytes)
+    _require_no_projection(name, dataset)
+    frames = [dataset]
+    if _value(name, dataset, "SOPClassUID") == EnhancedCTImageStorage:
+        with _pydicom(name, "the frames of the Enhanced CT image cannot be told apart"):
+            frames = single_frames(dataset)
+    return tuple(_read_placed(name, frame) for frame in frames)
+
+
+def _read_placed(name: Path, dataset: pydicom.Dataset) -> DicomSlice:
+    header = _read_header(name, dataset)
+    if not header.has_plane:
+        raise _fault(name, "ImagePositionPatient", None, "the position of the slice")
+    is_ct = _value(name, dataset, "SOPClassUID") in (CTImageStorage, EnhancedCTImageStorage)
+    if is_ct and _value(name, dataset, "RescaleSlope") is None:
+        raise _fault(name, "RescaleSlope", None, "that of a CT image")
+    _require_codestream_size(header, dataset)
+    return DicomSlice(header, Slice(_read_hu(header, dataset), header.scale, header.scanner_from_slice))
+
+
+def _require_codestream_size(header: SliceHeader, dataset: pydicom.Dataset) -> None:
+    """A decoder goes by what the compressed image says, whatever the object says."""
+    with _pydicom(header.path, f"{_tag('TransferSyntaxUID')} cannot be read"):
+        syntax = UID(str(dataset.file_meta.TransferSyntaxUID))
+        if not syntax.is_encapsulated or syntax == RLELossless:
+            return
+    with _pydicom(header.path, f"{_tag('PixelData')} cannot be decoded"):
+        size = size_of(single_frame(dataset))
+    if size != CodestreamSize(header.rows, header.columns, 1):
+        raise DicomError(
+            header.path,
+            f"{_tag('PixelData')} holds an image of {size}, expected {header.rows} rows, "
+            f"{header.columns} columns and one component",
+        )
+
+
+def _require_decoded_size(name: Path, dataset: pydicom.Dataset, max_bytes: int) -> None:
+    """Before anything is decoded: a small object may claim, and fill, a very large image."""
+    rows, columns = (_integer(name, dataset, keyword, 1, MAX_SIDE_PX) for keyword in ("Rows", "Columns"))
+    allocated = _integer(name, dataset, "BitsAllocated", 8, 32)
+    frames = 1
+    if _value(name, dataset, "NumberOfFrames") is not None:
+        frames = _integer(name, dataset, "NumberOfFrames", 1, 2**31 - 1)
+    size = rows * columns * frames * allocated // 8
+    if size > max_bytes:
+        raise DicomError(name, f"its pixels take {size} bytes, expected {max_bytes} at most")
+
+
+def _require_no_projection(name: Path, dataset: pydicom.Dataset) -> None:
+    image_type = _value(name, dataset, "ImageType") or ()
+    if "LOCALIZER" in image_type:
+        raise _fault(name, "ImageType", list(image_type), "a slice")
+    volume = _value(name, dataset, "VolumetricProperties")
+    if volume not in (None, "VOLUME"):
+        raise _fault(name, "VolumetricProperties", volume, "VOLUME")
+
+
+def _inflated(name: Path, content: bytes, max_bytes: int) -> bytes:
+    """The file with its data set as it is without the deflated transfer syntax.
+
+    pydicom itself would inflate without a bound.
+    """
+    if len(content) < _META_START + _META_LENGTH.size:
+        raise DicomError(name, f"is damaged: has {len(content)} bytes, expected a whole DICOM file")
+    tag, length = _META_LENGTH.unpack_from(content, _META_START)
+    if tag != _META_LENGTH_TAG:
+        raise DicomError(name, "is damaged: found no length of the file meta information (0002,0000) at byte 132")
+    start = _META_START + _META_LENGTH.size + length
+    with _pydicom(name, "is damaged, expected file meta information (group 0002)"):
+        meta = FileMetaDataset(read_dataset(BytesIO(content[_META_START:start]), False, True))
+        syntax = meta.TransferSyntaxUID
+    if syntax != DeflatedExplicitVRLittleEndian:
+        return content
+    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
+    try:
+        data = inflater.decompress(content[start:], max_bytes)
+    except zlib.error as error:
+        raise DicomError(name, f"is damaged: its deflated data cannot be inflated: {error}") from None
+    if inflater.unconsumed_tail:
+        raise DicomError(name, f"its deflated data inflate to more than {max_bytes} bytes, expected fewer")
+    if not inflater.eof:
+        raise DicomError(name, "is damaged: its deflated data end too soon")
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    inflated = BytesIO()
+    with _pydicom(name, "is damaged, expected file meta information (group 0002)"):
+        write_file_meta_info(inflated, meta, enforce_standard=False)  # type: ignore[arg-type]
+    return content[:_META_START] + inflated.getvalue() + data
+
+
 def _listed(folder: Path) -> list[Path]:
     try:
         return sorted(folder.iterdir())
@@ -166,7 +286,7 @@ def _not_dicom(file: Path) -> str | None:
             start = stream.read(132)
     except OSError as error:
         raise DicomError(file, f"cannot be read: {error.strerror}") from error
-    return None if start[128:] == b"DICM" else "not a DICOM file: found no letters DICM at byte 128"
+    return None if start[128:] == b"DICM" else _NO_LETTERS
 
 
 def _not_image(file: Path, dataset: pydicom.Dataset) -> str | None:
@@ -187,8 +307,12 @@ def _read_dataset(file: Path, *, stop_before_pixels: bool) -> pydicom.Dataset:
     what = _not_dicom(file)
     if what is not None:
         raise DicomError(file, f"{what}, expected a DICOM file")
+    return _parse(file, file, stop_before_pixels=stop_before_pixels)
+
+
+def _parse(file: Path, source: Path | BytesIO, *, stop_before_pixels: bool) -> pydicom.Dataset:
     with _pydicom(file, "is damaged, expected a whole DICOM file"):
-        dataset: pydicom.Dataset = pydicom.dcmread(file, stop_before_pixels=stop_before_pixels)
+        dataset: pydicom.Dataset = pydicom.dcmread(source, stop_before_pixels=stop_before_pixels)
     return dataset
 
 
@@ -322,6 +446,8 @@ def _without_unused_bits(stored: NDArray[Any], bits: int, signed: bool) -> NDArr
     unused = 8 * stored.dtype.itemsize - bits
     if unused <= 0:
         return stored
+    # Values of a big-endian file keep that order; looked at as other integers, they would be other values.
+    stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
     integer = stored.view(np.dtype(f"{'i' if signed else 'u'}{stored.dtype.itemsize}"))
     clean: NDArray[Any] = (integer << unused) >> unused
     return clean

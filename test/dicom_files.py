@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from pydicom.dataset import FileDataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.uid import CTImageStorage, EnhancedCTImageStorage, ExplicitVRLittleEndian, generate_uid
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
@@ -61,7 +61,10 @@ def write_slice(path: Path, stored: ArrayLike, z: float = 0.0, **elements: Any) 
     meta.MediaStorageSOPClassUID = values.get("SOPClassUID", CTImageStorage)
     meta.MediaStorageSOPInstanceUID = values["SOPInstanceUID"]
     meta.TransferSyntaxUID = values.pop("TransferSyntaxUID", ExplicitVRLittleEndian)
-    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    little_endian = meta.TransferSyntaxUID.is_little_endian
+    dataset = FileDataset(
+        str(path), {}, file_meta=meta, preamble=b"\0" * 128, is_implicit_VR=False, is_little_endian=little_endian
+    )
     for keyword, value in values.items():
         setattr(dataset, keyword, value)
     _save(dataset, path)
@@ -69,10 +72,48 @@ def write_slice(path: Path, stored: ArrayLike, z: float = 0.0, **elements: Any) 
 
 
 def _save(dataset: FileDataset, path: Path) -> None:
-    # pydicom 3 renamed the argument, and deprecates the attributes that pydicom 2 needs.
+    # pydicom 3 renamed the argument.
     if "enforce_file_format" in inspect.signature(dataset.save_as).parameters:
         dataset.save_as(path, enforce_file_format=True)
     else:
-        dataset.is_little_endian = True
-        dataset.is_implicit_VR = False
         dataset.save_as(path, write_like_original=False)
+
+
+def write_enhanced_ct(path: Path, frames: ArrayLike, heights: list[float], **elements: Any) -> Path:
+    """Write an Enhanced CT image of `frames` (frame, rows, columns), HU = stored - 1024, at heights in mm.
+
+    Spacing [0.7, 0.4] and orientation are shared by the frames, position and rescale are each frame's own.
+    elements: of the object itself, as in write_slice.
+    """
+    pixels = np.asarray(frames, np.uint16)
+
+    def item(**values: Any) -> Dataset:
+        one = Dataset()
+        for keyword, value in values.items():
+            setattr(one, keyword, value)
+        return one
+
+    shared = item(
+        PixelMeasuresSequence=[item(PixelSpacing=[0.7, 0.4])],
+        PlaneOrientationSequence=[item(ImageOrientationPatient=[1.0, 0.0, 0.0, 0.0, 0.8, -0.6])],
+    )
+    per_frame = [
+        item(
+            PlanePositionSequence=[item(ImagePositionPatient=[-10.0, -20.0, z])],
+            PixelValueTransformationSequence=[item(RescaleSlope=1.0, RescaleIntercept=-1024.0)],
+        )
+        for z in heights
+    ]
+    usual: dict[str, Any] = {
+        "SOPClassUID": EnhancedCTImageStorage,
+        "NumberOfFrames": len(pixels),
+        "Rows": pixels.shape[1],
+        "Columns": pixels.shape[2],
+        "SharedFunctionalGroupsSequence": [shared],
+        "PerFrameFunctionalGroupsSequence": per_frame,
+        "PixelData": pixels.tobytes(),
+        **dict.fromkeys(
+            ("PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient", "RescaleSlope", "RescaleIntercept")
+        ),
+    }
+    return write_slice(path, pixels[0], **{**usual, **elements})

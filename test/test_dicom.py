@@ -14,6 +14,7 @@ from dicom_files import CATPHAN, SHARED_DATA, real, write_slice
 from pydicom.encaps import encapsulate
 from pydicom.uid import (
     EnhancedCTImageStorage,
+    ExplicitVRBigEndian,
     JPEG2000Lossless,
     MRImageStorage,
     RTStructureSetStorage,
@@ -62,6 +63,13 @@ def test_bits_above_the_stored_ones_do_not_count(tmp_path, signed):
     stored = (wanted.astype(np.uint16) & 0x0FFF) | 0xA000
     path = write_slice(tmp_path / "a.dcm", stored, BitsStored=12, HighBit=11, PixelRepresentation=signed)
     np.testing.assert_array_equal(read_slice(path).ct_slice.hu, wanted - 1024.0)
+
+
+def test_bits_above_the_stored_ones_do_not_count_in_a_big_endian_file_either(tmp_path):
+    stored = (IMAGE | 0xA000).astype(">u2")
+    elements = {"TransferSyntaxUID": ExplicitVRBigEndian, "PixelData": stored.tobytes(), "BitsStored": 12}
+    path = write_slice(tmp_path / "a.dcm", IMAGE, 0.0, **elements, HighBit=11)
+    np.testing.assert_array_equal(read_slice(path).ct_slice.hu, IMAGE - 1024.0)
 
 
 def test_padding_never_looks_like_metal(tmp_path):

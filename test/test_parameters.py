@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from stereoreg_ros.nodes import reception_parameters
 from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
+from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
 from stereoreg_ros.options import MATCHERS, RegistrationOptions
 
-CONFIG = Path(__file__).resolve().parent.parent / "config" / "register_node.yaml"
+CONFIG = Path(__file__).resolve().parent.parent / "config"
 DEFAULTS = {entry.name: entry.default for entry in ENTRIES}
 
 CONTRACT = {
@@ -40,7 +42,7 @@ def test_table_holds_the_contract_and_every_option():
     assert len(DEFAULTS) == len(ENTRIES)
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
+@pytest.mark.parametrize("entry", [*ENTRIES, *reception_parameters.ENTRIES], ids=lambda entry: entry.name)
 def test_descriptor(entry):
     descriptor = entry.descriptor
     assert descriptor.description == entry.description != ""
@@ -50,20 +52,23 @@ def test_descriptor(entry):
     elif isinstance(entry.default, int) and not isinstance(entry.default, bool):
         (bounds,) = descriptor.integer_range
         assert (bounds.from_value, bounds.to_value, bounds.step) == (entry.low, entry.high, 0)
-    elif isinstance(entry.default, tuple) and isinstance(entry.default[0], str):
-        assert descriptor.additional_constraints == "any number of names"
+    elif entry.default == ():
+        assert (descriptor.dynamic_typing, descriptor.additional_constraints) == (True, "a list of names")
     elif isinstance(entry.default, tuple):
         assert descriptor.additional_constraints == f"{len(entry.default)} numbers"
 
 
-def test_shipped_file_equals_the_defaults_and_explains_them():
-    text = CONFIG.read_text(encoding="utf-8")
-    values = yaml.safe_load(text)["/**/register_node"]["ros__parameters"]
-    assert values == {entry.name: entry.value for entry in ENTRIES}
-    assert list(values) == list(DEFAULTS)
-    assert {name: type(value) for name, value in values.items()} == {e.name: type(e.value) for e in ENTRIES}
+@pytest.mark.parametrize(
+    ("node", "entries"), [("register_node", ENTRIES), ("receive_dicom_node", reception_parameters.ENTRIES)]
+)
+def test_shipped_file_equals_the_defaults_and_explains_them(node, entries):
+    text = (CONFIG / f"{node}.yaml").read_text(encoding="utf-8")
+    values = yaml.safe_load(text)[f"/**/{node}"]["ros__parameters"]
+    assert values == {entry.name: entry.value for entry in entries}
+    assert list(values) == [entry.name for entry in entries]
+    assert {name: type(value) for name, value in values.items()} == {e.name: type(e.value) for e in entries}
     lines = [line.strip() for line in text.splitlines()]
-    for entry in ENTRIES:
+    for entry in entries:
         (number,) = (n for n, line in enumerate(lines) if line.startswith(f"{entry.name}:"))
         bounds = f"; from {entry.low:g} to {entry.high:g}" if entry.low is not None else ""
         assert lines[number - 1] == f"# {entry.description}{bounds}"
@@ -105,6 +110,33 @@ def test_values_reach_their_places():
 def test_faulty_value_is_named(name, value, sentence):
     with pytest.raises(ValueError, match=sentence):
         NodeSettings.from_parameters({**DEFAULTS, name: value})
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"ae_title": ""}, "ae_title: found '', expected an AE title of 1 to 16 characters"),
+        ({"ae_title": " CT"}, "ae_title: found ' CT', expected an AE title"),
+        ({"ae_title": "Ü"}, "ae_title: found 'Ü', expected an AE title of printable ASCII"),
+        ({"ae_title": "A TITLE TOO LONG."}, "ae_title: .*, expected an AE title of 1 to 16 characters"),
+        ({"allowed_callers": ("CT1", "CT\\2")}, "allowed_callers: found .*, expected an AE title"),
+        ({"allowed_callers": (1, 2)}, "allowed_callers: found 1, expected an AE title"),
+        ({"allowed_callers": "CT1"}, "allowed_callers is 'CT1', expected a list of AE titles"),
+        ({"tls_key": "key.pem"}, "one of tls_certificate and tls_key is empty, expected both or neither"),
+        ({"tls_certificate": "host.pem"}, "one of tls_certificate and tls_key is empty, expected both or neither"),
+        ({"tls_client_ca": "ca.pem"}, "tls_client_ca is set without tls_certificate, expected both"),
+        ({"watch_folder": "/nowhere"}, "watch_folder is '/nowhere', expected a folder"),
+        ({"watch_folder": "/", "keep_folder": "/kept"}, "keep_folder /kept lies in watch_folder /"),
+        ({"watch_folder": "/", "keep_folder": "/"}, "every slice would come twice"),
+    ],
+)
+def test_faulty_value_of_the_receiver_is_named(values, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        ReceptionSettings(**values)
+
+
+def test_the_receiver_tells_clients_their_limits_in_bytes():
+    assert ReceptionSettings(max_object_mb=3, allowed_callers=("CT1", "CT2")).limits.max_object_bytes == 3 * 2**20
 
 
 @pytest.mark.parametrize("matcher", MATCHERS)

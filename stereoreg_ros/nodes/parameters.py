@@ -45,9 +45,12 @@ class Entry:
         if self.word is not None:
             descriptor.dynamic_typing = True
             descriptor.additional_constraints = f"a number, or '{self.word}'"
-        if isinstance(self.default, tuple):
-            texts = isinstance(self.default[0], str)
-            descriptor.additional_constraints = "any number of names" if texts else f"{len(self.default)} numbers"
+        if self.default == ():
+            # An empty list has no type of its own, so that ROS would take it for one of bytes.
+            descriptor.dynamic_typing = True
+            descriptor.additional_constraints = "a list of names"
+        elif isinstance(self.default, tuple):
+            descriptor.additional_constraints = f"{len(self.default)} numbers"
         elif self.low is not None and self.high is not None:
             if isinstance(self.default, int):
                 descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high))]
@@ -107,7 +110,6 @@ class NodeSettings:
     options: RegistrationOptions
     calibration: CalibrationOptions
     frame_file: str = setting("cube6", "frame file: a path, or the name of a shipped frame")
-    # rclpy cannot tell what an empty list is a list of.
     frame_files: tuple[str, ...] = setting(
         ("",),
         "files of several frames, in place of frame_file; each gets topics under its name; [''] for none",
@@ -145,6 +147,9 @@ class NodeSettings:
             )
         if self.rescale_slope == 0 or not math.isfinite(self.rescale_slope):
             raise ValueError(f"rescale_slope is {self.rescale_slope!r}, expected a number that is not 0")
+        names = self.frame_files
+        if not isinstance(names, tuple) or not all(isinstance(name, str) and name for name in names):
+            raise ValueError(f"frame_files is {names!r}, expected a list of names or paths")
         for name in ("frame_file", "fiducial_frame_id"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is empty, expected a name")
@@ -165,7 +170,7 @@ class NodeSettings:
     @property
     def frame_sources(self) -> tuple[str, ...]:
         """Files or names of the frames to be registered."""
-        return tuple(source for source in self.frame_files if source) or (self.frame_file,)
+        return self.frame_files or (self.frame_file,)
 
     @property
     def scale(self) -> PixelScale | None:

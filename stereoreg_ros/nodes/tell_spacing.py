@@ -52,7 +52,7 @@ class SpacingTeller:
         is told again when it returns.
         """
         if not self._client.service_is_ready():
-            self._forget()
+            self.forget()
             self._say(f"waiting for the parameter service of {self._target}")
             return False
         if self._request is not None:
@@ -62,6 +62,13 @@ class SpacingTeller:
         if self._request is None and time.monotonic() >= self._retry_at_s:
             self._send(scale)
         return False
+
+    def forget(self) -> None:
+        """Take nothing for accepted: the target may be another process than before, and is told anew."""
+        self._accepted = None
+        if self._request is not None:
+            self._client.remove_pending_request(self._request.answer)
+            self._request = None
 
     def _send(self, scale: PixelScale) -> None:
         parameters = [
@@ -75,7 +82,7 @@ class SpacingTeller:
     def _take_answer(self, request: _Request) -> None:
         if not request.answer.done():
             if time.monotonic() > request.deadline_s:
-                self._forget()
+                self.forget()
                 self._say(f"{self._target} did not answer within {ANSWER_S:g} s, asking again")
             return
         self._request = None
@@ -89,12 +96,6 @@ class SpacingTeller:
         else:
             self._retry_at_s = time.monotonic() + RETRY_S
             self._say(f"{self._target} refused the pixel spacing: {result.reason}", refused=True)
-
-    def _forget(self) -> None:
-        self._accepted = None
-        if self._request is not None:
-            self._client.remove_pending_request(self._request.answer)
-            self._request = None
 
     def _say(self, sentence: str, *, refused: bool = False) -> None:
         if sentence == self._last_said:
