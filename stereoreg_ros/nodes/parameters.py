@@ -111,8 +111,7 @@ class NodeSettings:
     calibration: CalibrationOptions
     frame_file: str = setting("cube6", "frame file: a path, or the name of a shipped frame")
     frame_files: tuple[str, ...] = setting(
-        ("",),
-        "files of several frames, in place of frame_file; each gets topics under its name; [''] for none",
+        (), "files of several frames, in place of frame_file; each gets topics under its name"
     )
     pixel_spacing: tuple[float, float] = setting(
         (0.0, 0.0), "pixel spacing [sx, sy]: between columns, between rows, mm/pixel; [0, 0]: not told yet"
@@ -122,6 +121,9 @@ class NodeSettings:
     rescale_intercept: float = setting(0.0, "HU = value * rescale_slope + rescale_intercept", -1e6, 1e6)
     scanner_frame_id: str = setting("", "frame_id of the scanner in all messages; empty: the image's frame_id")
     fiducial_frame_id: str = setting("stereotactic_frame", "name of the stereotactic frame's axes in messages")
+    slice_pose_required: bool = setting(
+        False, "whether an image must come with a slice_pose, even before anybody publishes one"
+    )
     publish_tf: bool = setting(False, "whether to send each pose to TF too, which needs tf2_ros")
     max_pose_age: float = setting(
         60.0, "oldest pose that target_in_frame may rest on, s since its slice came", 0.1, 1e6

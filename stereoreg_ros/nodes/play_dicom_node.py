@@ -56,7 +56,7 @@ class PlayDicomNode(Node):
         if not self._series.headers[0].has_plane:
             self.get_logger().warning(f"{values['path']} has no position and no orientation: no slice_pose")
         target: str = values["register_node"]
-        self._teller = SpacingTeller(self, target) if target else None
+        self._teller = SpacingTeller(self, target, with_slice_poses=True) if target else None
         self._publisher = SlicePublisher(self, values["frame_id"])
         self._next = 0
         self._due_s = 0.0

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from stereoreg_ros.nodes.parameters import ParameterError
 
 # Deep enough that no slice is lost while one is registered, and small enough not to hoard memory.
 QUEUE: Final = QoSProfile(depth=10)
@@ -23,12 +29,12 @@ _OVERRIDDEN: Final = (
 _Message = TypeVar("_Message")
 
 
-def overridable() -> QoSOverridingOptions:
+def _overridable() -> QoSOverridingOptions:
     """The policies that `qos_overrides` parameters may change."""
     return QoSOverridingOptions(_OVERRIDDEN)
 
 
-def copy_of(profile: QoSProfile) -> QoSProfile:
+def _copy_of(profile: QoSProfile) -> QoSProfile:
     """A profile of one's own: overrides are written into the one that is given."""
     return QoSProfile(
         history=profile.history,
@@ -48,28 +54,49 @@ def publisher_of(node: Node, message_type: type[_Message], topic: str, profile: 
             f"with less, or this node with -p qos_overrides.{publisher.topic_name}.publisher.{policy}:=<its value>"
         )
 
-    publisher: Publisher = node.create_publisher(
-        message_type,
-        topic,
-        copy_of(profile),
-        event_callbacks=PublisherEventCallbacks(incompatible_qos=tell),
-        qos_overriding_options=overridable(),
-    )
+    with _overrides_by_name():
+        publisher: Publisher = node.create_publisher(
+            message_type,
+            topic,
+            _copy_of(profile),
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=tell),
+            qos_overriding_options=_overridable(),
+        )
     return publisher
 
 
-def telling_subscription(node: Node, topic: str) -> SubscriptionEventCallbacks:
-    """Event callbacks of a subscription that tell of publishers which offer less than it asks for."""
+def subscription_of(
+    node: Node, message_type: type[_Message], topic: str, callback: Callable[..., None], profile: QoSProfile
+) -> Subscription:
+    """A subscription whose quality can be overridden, and which tells of publishers that offer too little."""
 
     def tell(event: Any) -> None:
-        policy, name = _policy(event), node.resolve_topic_name(topic)
+        policy = _policy(event)
         less = {"reliability": "best_effort", "durability": "volatile"}.get(policy, "<its value>")
         node.get_logger().warning(
-            f"a publisher of {name} is not heard: it offers less {policy} than is asked for; start this node with "
-            f"-p qos_overrides.{name}.subscription.{policy}:={less}"
+            f"a publisher of {subscription.topic_name} is not heard: it offers less {policy} than is asked for; start "
+            f"this node with -p qos_overrides.{subscription.topic_name}.subscription.{policy}:={less}"
         )
 
-    return SubscriptionEventCallbacks(incompatible_qos=tell)
+    with _overrides_by_name():
+        subscription: Subscription = node.create_subscription(
+            message_type,
+            topic,
+            callback,
+            _copy_of(profile),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=tell),
+            qos_overriding_options=_overridable(),
+        )
+    return subscription
+
+
+@contextmanager
+def _overrides_by_name() -> Iterator[None]:
+    """Overrides that are none end in a ParameterError."""
+    try:
+        yield
+    except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
+        raise ParameterError(f"qos_overrides: {error}") from None
 
 
 def _policy(event: Any) -> str:

@@ -69,7 +69,9 @@ class ReceiveDicomNode(Node):
         self._settings = settings = declare_reception(self)
         self._queue = SliceQueue(settings.max_queue)
         self._publisher = SlicePublisher(self, settings.frame_id)
-        self._teller = SpacingTeller(self, settings.register_node) if settings.register_node else None
+        self._teller = (
+            SpacingTeller(self, settings.register_node, with_slice_poses=True) if settings.register_node else None
+        )
         self._answers = RegistrationAnswers(self)
         self._last_stamp_ns = 0
         self._sent: ReceivedSlice | None = None

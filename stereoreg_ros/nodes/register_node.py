@@ -33,14 +33,14 @@ from stereoreg_ros.nodes.diagnostic_status import status_of, status_of_unusable
 from stereoreg_ros.nodes.frame_output import FrameOutput, FrameTopics
 from stereoreg_ros.nodes.markers import markers_of
 from stereoreg_ros.nodes.parameters import NodeSettings, ParameterError, changed_settings, declare_settings
-from stereoreg_ros.nodes.quality import QUEUE, copy_of, overridable, publisher_of, telling_subscription
+from stereoreg_ros.nodes.quality import QUEUE, publisher_of, subscription_of
 from stereoreg_ros.nodes.scale_keeper import ScaleKeeper
 from stereoreg_ros.nodes.slice_poses import WAIT_S, SlicePoses
 from stereoreg_ros.nodes.spinning import run
 from stereoreg_ros.nodes.stream_status import StreamStatus
 from stereoreg_ros.nodes.targets import TargetInFrame, status_of_target, target_in_frame
 from stereoreg_ros.nodes.transforms import broadcaster_of, has_tf2
-from stereoreg_ros.registration import register_frames
+from stereoreg_ros.registration import prepare, register_frames
 from stereoreg_ros.result import Reason, Refusal, Registration
 
 _LOOK_FOR_OVERDUE_S = 0.1
@@ -74,9 +74,9 @@ class RegisterNode(Node):
         self._overlay = publisher_of(self, Image, "overlay", QUEUE)
         self._markers = publisher_of(self, MarkerArray, "markers", QUEUE)
         # The pose before the image: where both are there, rclpy serves them in this order and no image has to wait.
-        self._slice_pose_input = self._subscribe(PoseStamped, "slice_pose", self._on_slice_pose)
-        self._image_input = self._subscribe(Image, "image", self._on_image)
-        self._subscribe(PointStamped, "target", self._on_target)
+        self._slice_pose_input = subscription_of(self, PoseStamped, "slice_pose", self._on_slice_pose, QUEUE)
+        self._image_input = subscription_of(self, Image, "image", self._on_image, QUEUE)
+        subscription_of(self, PointStamped, "target", self._on_target, QUEUE)
         self._more_wait = self.create_guard_condition(self._register_next)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=steady)
@@ -95,16 +95,6 @@ class RegisterNode(Node):
     def images_come(self) -> bool:
         """Whether somebody publishes images."""
         return self.count_publishers(self._image_input.topic_name) > 0
-
-    def _subscribe(self, message_type: Any, topic: str, callback: Callable[..., None]) -> Any:
-        return self.create_subscription(
-            message_type,
-            topic,
-            callback,
-            copy_of(QUEUE),
-            event_callbacks=telling_subscription(self, topic),
-            qos_overriding_options=overridable(),
-        )
 
     # From an image to a pose, in the order of the data.
 
@@ -150,7 +140,11 @@ class RegisterNode(Node):
             self._register(image, MessageError(f"no slice_pose with the image's stamp came within {WAIT_S:g} s"))
 
     def _slice_pose_expected(self) -> bool:
-        return self._slice_pose_seen or self.count_publishers(self._slice_pose_input.topic_name) > 0
+        return (
+            self.settings.slice_pose_required
+            or self._slice_pose_seen
+            or self.count_publishers(self._slice_pose_input.topic_name) > 0
+        )
 
     def _register(self, image: Image, scanner_from_slice: Pose | MessageError) -> None:
         """Register one image and publish what came of it; whatever is in the image, the node lives on."""
@@ -321,6 +315,13 @@ class RegisterNode(Node):
         alone = len(self._checked_frames) == 1
         self._topics = [FrameTopics(self, "" if alone else f"{frame.name}/") for frame in self._checked_frames]
         self._outputs = [FrameOutput(*both) for both in zip(self._checked_frames, self._topics, strict=True)]
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Fill the tables that the first slices would wait for; until the scale is told nobody knows which."""
+        if self.settings.scale is not None:
+            for output in self._outputs:
+                prepare(output.frame, self.settings.scale, self.settings.options)
 
     def _choose_tf(self) -> None:
         if self.settings.publish_tf and self._send_transform is None:
@@ -354,6 +355,8 @@ class RegisterNode(Node):
             self._forget_slices()
         if names & {"pixel_spacing", "pixel_shear"} and self._scale.told(scale_before):
             self._forget_slices()
+        if names & _OF_THE_TABLES:
+            self._prepare()
 
     def _forget_slices(self) -> None:
         """A slice seen under another frame or scale says nothing about this one."""
@@ -362,6 +365,8 @@ class RegisterNode(Node):
         self._scale.sightings.clear()
 
 
+# What the matcher's tables depend on.
+_OF_THE_TABLES = {"pixel_spacing", "spot_noise_px", "matcher", "nominal_orientation", "max_rotation_deg", "min_inliers"}
 _NO_TF2 = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
 
 

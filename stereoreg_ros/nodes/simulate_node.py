@@ -151,7 +151,7 @@ class SimulateNode(Node):
         except ValueError as error:
             raise ParameterError(str(error)) from None
         target = self._settings.register_node
-        self._teller = SpacingTeller(self, target) if target else None
+        self._teller = SpacingTeller(self, target, with_slice_poses=False) if target else None
         self._image_publisher = self.create_publisher(Image, "image", _QOS)
         self._pose_publisher = self.create_publisher(PoseStamped, "true_pose", _TRUTH_QOS)
         self._published = 0

@@ -29,12 +29,14 @@ class _Request:
 class SpacingTeller:
     """Sets `pixel_spacing` and `pixel_shear` of the node `target`, both or neither, without ever blocking.
 
-    target: the node's name; a relative one is taken in the namespace of `node`. Raises ParameterError on a name that
-    ROS does not allow.
+    target: the node's name; a relative one is taken in the namespace of `node`. with_slice_poses: whether each slice
+    comes with a slice_pose; told too, as a slice without its own would be registered in the wrong axes. Raises
+    ParameterError on a name that ROS does not allow.
     """
 
-    def __init__(self, node: Node, target: str) -> None:
+    def __init__(self, node: Node, target: str, *, with_slice_poses: bool) -> None:
         self._target = target
+        self._with_slice_poses = with_slice_poses
         self._logger = node.get_logger()
         try:
             self._client = node.create_client(SetParametersAtomically, f"{target}/set_parameters_atomically")
@@ -74,6 +76,7 @@ class SpacingTeller:
         parameters = [
             Parameter("pixel_spacing", Parameter.Type.DOUBLE_ARRAY, [float(scale.sx), float(scale.sy)]),
             Parameter("pixel_shear", Parameter.Type.DOUBLE, float(scale.shear)),
+            Parameter("slice_pose_required", Parameter.Type.BOOL, self._with_slice_poses),
         ]
         request = SetParametersAtomically.Request(parameters=[one.to_parameter_msg() for one in parameters])
         answer = self._client.call_async(request)
