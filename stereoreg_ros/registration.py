@@ -38,11 +38,16 @@ _IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
 _WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 0.5, 0.75
 
 
-def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:
-    """Fill the tables that most slices with `frame` need, in a second or two; else the first slices wait for them."""
+def prepare(
+    frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None, within_s: float = math.inf
+) -> None:
+    """Fill the tables that most slices with `frame` need, in a second or two; else the first slices wait for them.
+
+    within_s: seconds after which no further table is begun; frames of many rods have tables for minutes.
+    """
     options = options or RegistrationOptions()
     if options.matcher == "three_line":
-        three_line.prepare(frame, _noise_mm(scale, options.spot_noise_px), options)
+        three_line.prepare(frame, _noise_mm(scale, options.spot_noise_px), options, within_s)
 
 
 def register_slice(

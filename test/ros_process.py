@@ -93,15 +93,6 @@ class NodeProcess:
         self._process.send_signal(with_signal)
         return self.wait(deadline_s), time.monotonic() - begun
 
-    @contextmanager
-    def frozen(self) -> Iterator[None]:
-        """Within, the process gets no time at all."""
-        self._process.send_signal(signal.SIGSTOP)
-        try:
-            yield
-        finally:
-            self._process.send_signal(signal.SIGCONT)
-
     def wait(self, deadline_s: float = DEADLINE_S) -> int:
         """Exit code of a process that ends by itself."""
         try:

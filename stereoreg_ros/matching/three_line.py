@@ -8,6 +8,7 @@ to stop, is said here.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -196,16 +197,24 @@ class _Search:
         return self._searched[index]
 
 
-def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> None:
-    """Fill the tables that most slices need, in which all rods show or all but one; sigma_mm: of the spots' centres."""
+def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions, within_s: float) -> None:
+    """Fill the tables that most slices need, in which all rods show or all but one.
+
+    sigma_mm: of the spots' centres; within_s: seconds after which no further table is begun.
+    """
+    end_s = time.monotonic() + within_s
     most, least = len(frame), max(len(frame) - 1, options.min_inliers)
     for lines, complete_from in triple_order(frame, options.min_inliers):
+        if time.monotonic() >= end_s:
+            return
         solver = _solver(frame, lines, _tolerance_mm(sigma_mm))
         for range_of_rods in ((most, most), (least, most), (least, least)):
             solver.table(*range_of_rods)
         if complete_from <= least:
             break
     for rods in range(options.min_inliers, most + 1):
+        if time.monotonic() >= end_s:
+            return
         plane_sample(frame, rods)
 
 

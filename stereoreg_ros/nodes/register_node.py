@@ -46,6 +46,8 @@ from stereoreg_ros.result import Reason, Refusal, Registration
 _LOOK_FOR_OVERDUE_S = 0.1
 _REPORT_STREAM_S = 1.0
 _REPEAT_WARNING_S = 5.0
+# Longer, and whoever sets a parameter would wait too long for the answer.
+_PREPARE_S = 2.0
 _TOPIC_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -321,7 +323,7 @@ class RegisterNode(Node):
         """Fill the tables that the first slices would wait for; until the scale is told nobody knows which."""
         if self.settings.scale is not None:
             for output in self._outputs:
-                prepare(output.frame, self.settings.scale, self.settings.options)
+                prepare(output.frame, self.settings.scale, self.settings.options, _PREPARE_S)
 
     def _choose_tf(self) -> None:
         if self.settings.publish_tf and self._send_transform is None:
