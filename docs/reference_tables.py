@@ -34,6 +34,7 @@ PARAMETERS: dict[str, tuple[Entry, ...]] = {
     "register_node": parameters.ENTRIES,
     "simulate_node": entries_of(SimulationSettings),
     "play_dicom_node": play_dicom_node.ENTRIES,
+    "receive_dicom_node": entries_of(ReceptionSettings),
 }
 # What every node of ROS has.
 _OF_ROS = re.compile(r"/rosout|/parameter_events|.*/(get|set|list|describe)_parameter\w*|.*/get_type_description")
