@@ -59,7 +59,7 @@ class Case:
     with_scale: bool = False
     rendered: bool = False
     max_rotation_deg: float = 180.0
-    image_noise_hu: float = 60.0
+    image_noise_hu: float = 20.0
 
     @property
     def name(self) -> str:
