@@ -10,12 +10,13 @@ import numpy as np
 from stereoreg_ros.design.ambiguity import trials
 from stereoreg_ros.design.layouts import Layouts
 from stereoreg_ros.design.meeting import meetings
-from stereoreg_ros.design.search import Wish, search
+from stereoreg_ros.design.search import Candidate, Wish, search
 from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import rotation_from_quaternion
 from stereoreg_ros.options import RegistrationOptions
 
-_ATTEMPTS = 4
-_POSES = 64
+_ATTEMPTS = 3
+_POSES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +40,10 @@ def propose(
     chains: int,
     progress: Callable[[str, float, float], bool] | None = None,
 ) -> Proposal:
-    """The first of a few searches, each with a seed of its own, whose frame is never ambiguous; else the least so.
+    """The best layout of a search that is never ambiguous; where none is, of another search, and at last the best one.
 
-    progress: told what is done, the share of it done and the least error so far, says whether to go on.
+    options: what the registration will be told, such as how the frame stands. progress: told what is done, the share of
+    it done and the least error so far, says whether to go on.
     Raises ValueError where no layout that can be built was found.
     """
     best: Proposal | None = None
@@ -51,41 +53,45 @@ def propose(
         def tell(share: float, least: float, what: str = what) -> bool:
             return progress is None or progress(what, share, least)
 
-        found = search(wish, seed + attempt, chains, tell)
-        layouts = wish.envelope.layouts(found.corners[None], wish.diameters_mm)
-        rounded = Layouts(np.round(layouts.starts, 1), np.round(layouts.ends, 1), layouts.diameters)
-        frame, error = rounded.frame(0, name), float(wish.target_errors(rounded)[0])
-        ambiguous, tried, interrupted = 0, 0, found.interrupted
-        if not interrupted:
+        for candidate in search(wish, seed + attempt, chains, tell):
+            frame, error = _rounded(wish, candidate, name)
+            if candidate.interrupted:
+                return best or Proposal(frame, error, 0, 0, True)
             try:
-                ambiguous, tried, interrupted = _ambiguous(wish, frame, error, options, seed, progress)
+                proposal = _tried(wish, frame, error, options, seed, progress)
             except KeyboardInterrupt:
-                interrupted = True
-        proposal = Proposal(frame, error, ambiguous, tried, interrupted)
-        if best is None or (tried > 0 and ambiguous < best.ambiguous):
-            best = proposal
-        if interrupted or ambiguous == 0:
-            break
+                proposal = Proposal(frame, error, 0, 0, True)
+            if proposal.interrupted or proposal.ambiguous == 0:
+                return proposal
+            best = best or proposal
     assert best is not None
     return best
 
 
-def _ambiguous(
+def _rounded(wish: Wish, candidate: Candidate, name: str) -> tuple[Frame, float]:
+    """Ends to a tenth of a millimetre, as they can be drilled; and the target error of that."""
+    layouts = wish.envelope.layouts(candidate.corners[None], wish.diameters_mm)
+    rounded = Layouts(np.round(layouts.starts, 1), np.round(layouts.ends, 1), layouts.diameters)
+    return rounded.frame(0, name), float(wish.target_errors(rounded)[0])
+
+
+def _tried(
     wish: Wish,
     frame: Frame,
     error: float,
     options: RegistrationOptions,
     seed: int,
     progress: Callable[[str, float, float], bool] | None,
-) -> tuple[int, int, bool]:
-    """How many spot sets were explained by more than one pose or by a wrong one, of how many; whether cut short."""
+) -> Proposal:
+    """The frame with how many spot sets were explained by more than one pose or by a wrong one."""
     heights = np.array([-wish.largest_height_mm, wish.largest_height_mm])
-    poses = meetings(_POSES, seed + 1, np.zeros(3), heights, wish.largest_tilt_deg)
+    nominal = rotation_from_quaternion(options.nominal_orientation)
+    poses = meetings(_POSES, seed + 1, np.zeros(3), heights, wish.largest_tilt_deg, nominal, options.max_rotation_deg)
     left_out: list[int | None] = [None, *range(len(frame))]
     total, ambiguous, tried = len(poses) * len(left_out), 0, 0
     for trial in trials(frame, poses, wish.imaging.scale, options, left_out, np.random.default_rng(seed)):
         tried += 1
         ambiguous += trial.reason == "ambiguous" or (not trial.reason and not trial.right)
         if progress is not None and not progress("trying poses", tried / total, error):
-            return ambiguous, tried, True
-    return ambiguous, tried, False
+            return Proposal(frame, error, ambiguous, tried, True)
+    return Proposal(frame, error, ambiguous, tried, False)

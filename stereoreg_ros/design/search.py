@@ -111,31 +111,35 @@ def random_layouts(wish: Wish, count: int, rng: np.random.Generator) -> Array:
     )
 
 
-def search(wish: Wish, seed: int, chains: int, progress: Callable[[float, float], bool] | None = None) -> Candidate:
-    """The best layout of several chains of hops; progress: told the share done and the least error so far, mm.
+def search(
+    wish: Wish, seed: int, chains: int, progress: Callable[[float, float], bool] | None = None
+) -> list[Candidate]:
+    """The layouts that several chains of hops have found, the best first; progress: told the share done and the least
+    error so far, mm, says whether to go on.
 
-    Where progress says not to go on, or an interruption (KeyboardInterrupt) comes, the best layout so far is returned.
-    The chains are spread over the cores by joblib, in whatever backend its `parallel_config` has chosen.
-    Raises ValueError where no layout that can be built was found.
+    Where it says not to, or an interruption (KeyboardInterrupt) comes, what was found so far is returned, at least the
+    best of some random layouts. The chains are spread over the cores by joblib, in whatever backend its
+    `parallel_config` has chosen. Raises ValueError where no layout that can be built was found.
     """
     seeds = np.random.SeedSequence(seed).spawn(chains + 1)
-    start = random_layouts(wish, _DRAWN, np.random.default_rng(seeds[-1]))
-    costs = wish.costs(start)
-    best, least = start[costs.argmin()], float(costs.min())
+    drawn = random_layouts(wish, _DRAWN, np.random.default_rng(seeds[-1]))
+    costs = wish.costs(drawn)
+    found = [(drawn[costs.argmin()], float(costs.min()))]
     done, interrupted, together = 0, False, effective_n_jobs(-1)
     try:
         while done < chains and not interrupted:
             # As many at a time as there are cores, so that somebody is told in between.
             batch = seeds[done : min(done + together, chains)]
-            for corners, cost in Parallel(n_jobs=-1)(delayed(_chain)(wish, one) for one in batch):
-                if cost < least and wish.can_be_built(corners[None])[0]:
-                    best, least = corners, cost
+            made = Parallel(n_jobs=-1)(delayed(_chain)(wish, one) for one in batch)
+            found += [(corners, cost) for corners, cost in made if wish.can_be_built(corners[None])[0]]
             done += len(batch)
+            least = min(cost for _, cost in found)
             interrupted = progress is not None and not progress(done / chains, least) and done < chains
     except KeyboardInterrupt:
         interrupted = True
-    error = wish.target_errors(wish.envelope.layouts(best[None], wish.diameters_mm))[0]
-    return Candidate(best, float(error), interrupted)
+    layouts = wish.envelope.layouts(np.array([corners for corners, _ in found]), wish.diameters_mm)
+    errors = wish.target_errors(layouts)
+    return [Candidate(found[row][0], float(errors[row]), interrupted) for row in np.argsort(errors)]
 
 
 def _chain(wish: Wish, seed: np.random.SeedSequence) -> tuple[Array, float]:
