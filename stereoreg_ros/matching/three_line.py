@@ -70,7 +70,8 @@ def match(
     nothing is found, the search ends where so few rods could hardly be told from chance. Where something is found, it
     goes on as long as an explanation of fewer rods, if it fits well, could come near: among the spots of the best
     explanation, as twins of a pose share them, and among all spots where chance may bring one that could be accepted.
-    Complete but for the seeds: see docs/matching.md for how many of the poses a triple of rods finds.
+    What was found is looked at once more from further triples of rods, for twins that one triple may have missed: see
+    docs/matching.md for how many of the poses a triple of rods finds.
     """
     gains, apart = spots.gains(frame), decades_apart(options)
     search = _Search(spots, frame, prior, options)
