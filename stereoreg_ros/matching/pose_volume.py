@@ -22,7 +22,7 @@ from scipy.stats import qmc
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.geometry.projection import cut, cut_jacobian
+from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
 from stereoreg_ros.matching.prior import Near, Prior
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 
@@ -74,22 +74,9 @@ class PlaneSample(NamedTuple):
 @lru_cache(maxsize=64)
 def plane_sample(frame: Frame, rods: int) -> PlaneSample:
     """Planes with normals evenly over the sphere and heights evenly over the frame; drawn once."""
-    ends = np.concatenate([frame.starts, frame.ends])
-    centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
-    radius = float(np.linalg.norm(ends - centre, axis=1).max()) + END_SLACK_MM
-    drawn = qmc.Sobol(3, scramble=True, seed=0).random_base2(_LOG2_PLANES)
-    z, turn = 2 * drawn[:, 0] - 1, 2 * np.pi * drawn[:, 1]
-    across = np.sqrt(1 - z**2)
-    normals = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
-    rotations = _any_rotations(normals)
-    # The frame's middle is at the slice's origin, but for its height.
-    translations = -(rotations @ centre)
-    translations[:, 2] += radius * (2 * drawn[:, 2] - 1)
+    rotations, translations, normals, radius = _planes(frame)
     cuts = cut(frame, rotations, translations)
-    with np.errstate(invalid="ignore"):
-        low, high = frame.lambda_min - END_SLACK_MM, frame.lambda_max + END_SLACK_MM
-        visible = (cuts.lambdas >= low) & (cuts.lambdas <= high)
-        visible &= np.abs(cuts.directions[..., 2]) >= LEAST_COSINE
+    visible = _visible(frame, cuts)
     chosen = np.flatnonzero(visible.sum(axis=1) >= rods)
     visible, points = visible[chosen], cuts.points_mm[chosen]
     jacobians = cut_jacobian(cuts.take(chosen), translations[chosen])
@@ -113,6 +100,41 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
     weight = 4 * np.pi * 2 * radius / len(normals)
     mean_ratio = float(np.concatenate(ratios).mean()) if sets.any() else 0.0
     return PlaneSample(normals[chosen], sets, widths, boxes, weight, mean_ratio, np.concatenate(squares))
+
+
+def typical_slices(frame: Frame, rods: int, most: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Up to `most` poses slice_from_frame (m, 3, 3), (m, 3) mm in which a slice cuts so many rods; and which (m, n)."""
+    rotations, translations, _, _ = _planes(frame)
+    visible = _visible(frame, cut(frame, rotations, translations))
+    chosen = np.flatnonzero(visible.sum(axis=1) >= rods)[:most]
+    return rotations[chosen], translations[chosen], visible[chosen]
+
+
+def _planes(frame: Frame) -> tuple[Array, Array, Array, float]:
+    """Poses slice_from_frame (p, 3, 3), (p, 3) mm with normals (p, 3) evenly over the sphere and heights evenly over
+    the frame, whose radius in mm is told too.
+    """
+    ends = np.concatenate([frame.starts, frame.ends])
+    centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    radius = float(np.linalg.norm(ends - centre, axis=1).max()) + END_SLACK_MM
+    drawn = qmc.Sobol(3, scramble=True, seed=0).random_base2(_LOG2_PLANES)
+    z, turn = 2 * drawn[:, 0] - 1, 2 * np.pi * drawn[:, 1]
+    across = np.sqrt(1 - z**2)
+    normals = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+    rotations = _any_rotations(normals)
+    # The frame's middle is at the slice's origin, but for its height.
+    translations = -(rotations @ centre)
+    translations[:, 2] += radius * (2 * drawn[:, 2] - 1)
+    return rotations, translations, normals, radius
+
+
+def _visible(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
+    """Which rods (p, n) the slices may show."""
+    with np.errstate(invalid="ignore"):
+        low, high = frame.lambda_min - END_SLACK_MM, frame.lambda_max + END_SLACK_MM
+        visible = (cuts.lambdas >= low) & (cuts.lambdas <= high)
+        visible &= np.abs(cuts.directions[..., 2]) >= LEAST_COSINE
+    return np.asarray(visible)
 
 
 def stretch(information: Array, variance_mm2: float) -> Array:

@@ -14,8 +14,10 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.consensus import (
     decades_apart,
     distinct,
@@ -26,12 +28,12 @@ from stereoreg_ros.matching.consensus import (
     score,
 )
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
-from stereoreg_ros.matching.pose_volume import plane_sample
+from stereoreg_ros.matching.pose_volume import plane_sample, typical_slices
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, search_seeds
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
-from stereoreg_ros.matching.triple_order import triple_order
+from stereoreg_ros.matching.triple_order import further_triples, triple_order
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.three_lines import ThreeLineSolver
@@ -44,6 +46,12 @@ _CHUNK = 4000
 _MOST_WORK = 6_000_000
 _WORK_OF_START, _WORK_OF_SEARCH = 40, 100_000
 _FEW_SPOTS = 30
+# An accepted explanation's spots are looked at from all triples of each set of four rods, as these have twins, and from
+# so many of each set of more.
+_FEWEST, _LOOKS_AT_FOUR, _LOOKS = 4, 4, 3
+# From so many rods on, only of a frame of which more than such a share of so many slices has twins; these are poses of
+# no more than this chi-square, with spots known to so many mm or worse.
+_FEWEST_WITHOUT_TWINS, _MANY_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 0.25, 32, 20.0, 0.25
 # Explanations that chance brings less often than this (log10) are not sought beside one that was found.
 _LOG10_RIVALS = -3.0
 
@@ -63,7 +71,8 @@ def match(
     nothing is found, the search ends where so few rods could hardly be told from chance. Where something is found, it
     goes on as long as an explanation of fewer rods, if it fits well, could come near: among the spots of the best
     explanation, as twins of a pose share them, and among all spots where chance may bring one that could be accepted.
-    Complete but for the seeds: see docs/matching.md for how many of the poses a triple of rods finds.
+    What was found is looked at once more from further triples of rods, for twins that one triple may have missed: see
+    docs/matching.md for how many of the poses a triple of rods finds.
     """
     gains, apart = spots.gains(frame), decades_apart(options)
     search = _Search(spots, frame, prior, options)
@@ -83,6 +92,13 @@ def match(
                 further = search.level if search.has_rivals(level, most_chi_square) else search.level_of_twins
                 found = distinct([*found, *further(level, most_chi_square, found)], gains)
             least_rods = level
+        if found and (known or search.is_acceptable(found[0])):
+            found = distinct([*found, *search.twins_of(found)], gains)
+        elif least_rods == _FEWEST <= len(frame):
+            # One triple is all that a set of four rods has been tried by: no level below finds what it has missed.
+            found = distinct([*found, *search.second_look(_FEWEST, found)], gains)
+            if found and search.is_acceptable(found[0]):
+                found = distinct([*found, *search.twins_of(found)], gains)
     except _TooMuchWorkError:
         return Found([], least_rods, "given up: too many of them look like parts of the frame")
     return Found(judged(found, spots, frame, prior, apart), least_rods)
@@ -113,8 +129,8 @@ class _Search:
     def __init__(self, spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> None:
         self._spots, self._frame, self._prior, self._options = spots, frame, prior, options
         self._order = triple_order(frame, options.min_inliers)
-        self._searched: dict[int, list[SeedSearch]] = {}
-        self._searched_down_to: dict[int, int] = {}
+        self._searched: dict[tuple[int, int, int], list[SeedSearch]] = {}
+        self._searched_down_to: dict[tuple[int, int, int], int] = {}
         self._log10_false_alarms: dict[Hypothesis, float] = {}
         self._work = 0.0
 
@@ -151,50 +167,109 @@ class _Search:
 
     def level(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """Explanations of so many rods, or more, besides the known; most_chi_square: see `SeedSearch.reaching`."""
-        for index, (_, complete_from) in enumerate(self._order):
-            for seeds in self._seeds(index, level):
-                starts = seeds.reaching(level, most_chi_square, known)
-                self._spend(_WORK_OF_START * starts.spot_of_line.size / 6 * (1 + len(self._spots.mm) / _FEW_SPOTS))
-                for first in range(0, len(starts.spot_of_line), _CHUNK):
-                    part = starts.take(slice(first, first + _CHUNK))
-                    for hypothesis in settle(self._spots, self._frame, part, self._options.min_inliers):
-                        if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
-                            yield hypothesis
+        for lines, complete_from in self._order:
+            yield from self._from_triple(lines, level, most_chi_square, known)
             if complete_from <= level:
                 return
 
+    def _from_triple(
+        self, lines: tuple[int, int, int], level: int, most_chi_square: float, known: list[Hypothesis]
+    ) -> Iterator[Hypothesis]:
+        for seeds in self._seeds(lines, level):
+            starts = seeds.reaching(level, most_chi_square, known)
+            self._spend(_WORK_OF_START * starts.spot_of_line.size / 6 * (1 + len(self._spots.mm) / _FEW_SPOTS))
+            for first in range(0, len(starts.spot_of_line), _CHUNK):
+                part = starts.take(slice(first, first + _CHUNK))
+                for hypothesis in settle(self._spots, self._frame, part, self._options.min_inliers):
+                    if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
+                        yield hypothesis
+
+    def second_look(self, level: int, known: list[Hypothesis]) -> Iterator[Hypothesis]:
+        """Explanations of so many rods, or more, besides the known, from further triples of rods than `level` tried."""
+        looks = _LOOKS_AT_FOUR if level == _FEWEST else _LOOKS
+        for lines in further_triples(self._frame, self._options.min_inliers, level, looks):
+            yield from self._from_triple(lines, level, math.inf, known)
+
     def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
-        """The same, but only from the spots of the best explanation known."""
+        """The same as `level`, but only from the spots of the best explanation known."""
+        search, here, rows = self._among_own(known)
+        return _renumbered(search.level(level, most_chi_square, here), rows)
+
+    def twins_of(self, known: list[Hypothesis]) -> Iterator[Hypothesis]:
+        """Twins of the best explanation, made of its spots, that one triple of rods may have missed.
+
+        The true pose may be the one that was missed, and what was found its twin: no level below would tell, as it
+        seeks what comes near the best with fewer rods.
+        """
+        rods = known[0].inliers
+        if not _may_have_twins(self._frame, rods, self._spots.sigma_mm):
+            return iter(())
+        search, here, rows = self._among_own(known)
+        return _renumbered(search.second_look(rods, here), rows)
+
+    def _among_own(self, known: list[Hypothesis]) -> tuple[_Search, list[Hypothesis], NDArray[np.intp]]:
+        """The search among the spots of the best explanation known; what is known, in terms of these; their rows."""
         rows = np.sort(known[0].spot_of_line[known[0].spot_of_line != UNMATCHED])
         if len(rows) == len(self._spots.mm):
-            yield from self.level(level, most_chi_square, known)
-            return
+            return self, known, rows
         search = _Search(self._spots.only(rows), self._frame, self._prior.only(rows), self._options)
         row_of = np.full(len(self._spots.mm) + 1, UNMATCHED)  # the last one is for UNMATCHED
         row_of[rows] = np.arange(len(rows))
-        here = [replace(one, spot_of_line=row_of[one.spot_of_line]) for one in known]
-        for twin in search.level(level, most_chi_square, here):
-            matched = twin.spot_of_line != UNMATCHED
-            yield replace(twin, spot_of_line=np.where(matched, rows[twin.spot_of_line], UNMATCHED))
+        return search, [replace(one, spot_of_line=row_of[one.spot_of_line]) for one in known], rows
 
     def _spend(self, work: float) -> None:
         self._work += work
         if self._work > _MOST_WORK:
             raise _TooMuchWorkError
 
-    def _seeds(self, index: int, level: int) -> list[SeedSearch]:
-        """The seeds of the triple at `index` of the order where a slice may cut `level` rods or more."""
-        down_to = self._searched_down_to.get(index, len(self._frame) + 1)
+    def _seeds(self, lines: tuple[int, int, int], level: int) -> list[SeedSearch]:
+        """The seeds of the triple of rods where a slice may cut `level` rods or more."""
+        down_to = self._searched_down_to.get(lines, len(self._frame) + 1)
         if level < down_to:
             self._spend(_WORK_OF_SEARCH)
-            solver = _solver(self._frame, self._order[index].lines, _tolerance_mm(self._spots.sigma_mm))
+            solver = _solver(self._frame, lines, _tolerance_mm(self._spots.sigma_mm))
             search = search_seeds(
                 self._spots, self._frame, solver, (level, down_to - 1), self._prior, self._options.min_inliers
             )
             self._spend(search.triples * len(self._frame) / 6)
-            self._searched.setdefault(index, []).append(search)
-            self._searched_down_to[index] = level
-        return self._searched[index]
+            self._searched.setdefault(lines, []).append(search)
+            self._searched_down_to[lines] = level
+        return self._searched[lines]
+
+
+def _renumbered(found: Iterator[Hypothesis], rows: NDArray[np.intp]) -> Iterator[Hypothesis]:
+    """Explanations of some of the spots in terms of all; rows: of these spots."""
+    for one in found:
+        matched = one.spot_of_line != UNMATCHED
+        yield replace(one, spot_of_line=np.where(matched, rows[one.spot_of_line], UNMATCHED))
+
+
+def _may_have_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:
+    """Whether so many spots of the frame, known to sigma_mm, have twins often enough to be looked for once more.
+
+    The distances between k spots set 2k - 3 conditions to the six numbers of two slices that show the same: four spots
+    have twins, and five near ones. From six on few slices have them, unless the frame is nearly symmetric.
+    """
+    if rods < _FEWEST_WITHOUT_TWINS:
+        return True
+    # In steps, so that few are looked up.
+    return _share_of_twins(frame, rods, max(2.0 ** math.ceil(math.log2(sigma_mm)), _LEAST_SIGMA_MM)) > _MANY_TWINS
+
+
+@lru_cache(maxsize=64)
+def _share_of_twins(frame: Frame, rods: int, sigma_mm: float) -> float:
+    """Share of typical slices that show so many rods with a second explanation of them all; 1 where no slice does."""
+    rotations, translations, visible = typical_slices(frame, rods, _TYPICAL_SLICES)
+    options, rng = RegistrationOptions(), np.random.default_rng(0)
+    twins = 0
+    for rotation, translation, seen in zip(rotations, translations, visible, strict=True):
+        shown = rng.permutation(np.flatnonzero(seen))[:rods]
+        points_mm = cut(frame, rotation, translation).points_mm[shown]
+        spots = Spots.of(points_mm, np.tile(sigma_mm**2 * np.eye(2), (rods, 1, 1)), None)
+        search = _Search(spots, frame, Prior(np.eye(3), math.pi), options)
+        near = [one for one in search.level(rods, math.inf, []) if one.chi_square < _NEAR_TWIN]
+        twins += len(distinct(near, spots.gains(frame))) > 1
+    return twins / len(rotations) if len(rotations) else 1.0
 
 
 def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions, within_s: float) -> None:
@@ -216,6 +291,8 @@ def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions, within_
         if time.monotonic() >= end_s:
             return
         plane_sample(frame, rods)
+    for rods in range(least, most + 1):
+        _may_have_twins(frame, rods, sigma_mm)
 
 
 def _tolerance_mm(sigma_mm: float) -> float:

@@ -37,8 +37,7 @@ def triple_order(frame: Frame, min_inliers: int) -> tuple[RankedTriple, ...]:
     every set of one rod less holds a triple, then of two less, and so on.
     """
     n = len(frame)
-    quality = _qualities(frame)
-    usable = {t: q for t, q in quality.items() if q > _USELESS * max(quality.values())}
+    usable = _usable(frame)
     masks = {t: sum(1 << line for line in t) for t in usable}
     left = sorted(usable, key=lambda t: -usable[t])
     order: list[RankedTriple] = []
@@ -60,6 +59,41 @@ def triple_order(frame: Frame, min_inliers: int) -> tuple[RankedTriple, ...]:
         if order:
             order[-1] = order[-1]._replace(complete_from=size)
     return tuple(order)
+
+
+@lru_cache(maxsize=64)
+def further_triples(frame: Frame, min_inliers: int, rods: int, looks: int) -> tuple[tuple[int, int, int], ...]:
+    """Triples to try after those of `triple_order`, until every set of `rods` rods holds `looks` that were tried.
+
+    Or all that it has. One triple misses poses in which its own spots lie in a line, or its equations have a double
+    root; the rods' other triples seldom share that.
+    """
+    n = len(frame)
+    usable = _usable(frame)
+    if not usable or rods > n or comb(n, rods) > _MOST_SUBSETS:
+        return ()
+    masks = {t: sum(1 << line for line in t) for t in usable}
+    order = triple_order(frame, min_inliers)
+    last = next((row for row, entry in enumerate(order) if entry.complete_from <= rods), len(order) - 1)
+    tried = {entry.lines for entry in order[: last + 1]}
+    subsets = np.array([sum(1 << line for line in subset) for subset in combinations(range(n), rods)])
+    holds = {t: (subsets & mask) == mask for t, mask in masks.items()}
+    wanted = np.minimum(np.sum([*holds.values()], axis=0), looks) - np.sum([holds[t] for t in tried], axis=0)
+    left = sorted(usable.keys() - tried, key=lambda t: -usable[t])
+    chosen: list[tuple[int, int, int]] = []
+    while (wanted > 0).any():
+        covers = [int((holds[t] & (wanted > 0)).sum()) for t in left]
+        best = left.pop(int(np.argmax(covers)))  # the first of the most: the one of the best quality
+        wanted = wanted - holds[best]
+        chosen.append(best)
+    return tuple(chosen)
+
+
+@lru_cache(maxsize=64)
+def _usable(frame: Frame) -> dict[tuple[int, int, int], float]:
+    """The triples that determine a pose, with their quality."""
+    quality = _qualities(frame)
+    return {t: q for t, q in quality.items() if q > _USELESS * max(quality.values())}
 
 
 def _qualities(frame: Frame) -> dict[tuple[int, int, int], float]:
