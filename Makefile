@@ -42,7 +42,7 @@ WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_R
 help:
 	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
 	@echo 'make demo       simulated scanner and registration as two processes; SLICES=$(SLICES) DEMO_OUTPUT=$(DEMO_OUTPUT)'
-	@echo 'make test       all tests; PYTEST_ARGS="-k word" to choose'
+	@echo 'make test       all tests, in two processes; PYTEST_ARGS="-k word" to choose, in one'
 	@echo 'make colcon-test  the tests of the core as colcon runs them'
 	@echo 'make matrix     the most telling tests on other versions: Ubuntu 24.04, the newest, ROS 2 Kilted'
 	@echo 'make docs       the documentation as a site: build/docs/index.html'
@@ -92,7 +92,7 @@ demo: venv
 	$(WITH_ROS) $(EXECUTABLES)/demo_report --slices $(SLICES) --output '$(DEMO_OUTPUT)'
 
 test: venv catphan dcmtk
-	$(WITH_ROS) .venv/bin/python -m pytest $(PYTEST_ARGS)
+	$(WITH_ROS) .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile)
 
 # colcon test is content where no test ran.
 colcon-test: venv
