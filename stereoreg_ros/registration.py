@@ -81,10 +81,11 @@ def register_frames(
     that and scale_covariance: see `register_spots`.
     """
     options = options or RegistrationOptions()
+    known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
     found = find_spots(ct_slice, options)
     results: list[Registration | Refusal] = []
     for frame, before in zip(frames, previous or [None] * len(frames), strict=True):
-        result = _register_found(found, ct_slice, frame, options, before, scale_covariance)
+        result = _register_found(found, ct_slice, frame, options, before, known)
         if result:
             found = found.take(np.delete(np.arange(len(found)), [match.spot for match in result.matches]))
         results.append(result)

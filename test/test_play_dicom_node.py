@@ -157,7 +157,7 @@ def test_nothing_is_played_before_the_spacing_is_accepted(client, series):
         receiver.refusal = ""
         client.wait_for(lambda: len(images) == len(poses) == 5, "five slices")
         assert player.output.count("no such spacing here") == 1
-    assert receiver.told[-1] == {"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0}
+    assert receiver.told[-1] == {"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0, "slice_pose_required": True}
 
 
 def test_target_lies_in_the_namespace_of_the_player(series):
@@ -166,7 +166,7 @@ def test_target_lies_in_the_namespace_of_the_player(series):
         with play(series, "-r", "__ns:=/left", register_node="robot"):
             poses, images = client.collect(PoseStamped, "slice_pose"), client.collect(Image, "image")
             client.wait_for(lambda: len(images) == len(poses) == 5, "five slices")
-        assert receiver.told == [{"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0}]
+        assert receiver.told == [{"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0, "slice_pose_required": True}]
 
 
 def test_receiver_that_starts_anew_is_told_anew(client, series):
@@ -182,7 +182,7 @@ def test_receiver_that_starts_anew_is_told_anew(client, series):
         second = Receiver(client)
         played = len(images)
         client.wait_for(lambda: len(images) > played + 5, "more slices")
-    assert second.told == first.told == [{"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0}]
+    assert second.told == first.told == [{"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0, "slice_pose_required": True}]
 
 
 def test_faulty_slice_is_left_out_and_reported(client, series):

@@ -149,7 +149,9 @@ class NodeSettings:
             )
         if self.rescale_slope == 0 or not math.isfinite(self.rescale_slope):
             raise ValueError(f"rescale_slope is {self.rescale_slope!r}, expected a number that is not 0")
-        names = self.frame_files
+        # An empty list in a parameter file arrives as nothing at all.
+        names = () if self.frame_files is None else self.frame_files
+        object.__setattr__(self, "frame_files", names)
         if not isinstance(names, tuple) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(f"frame_files is {names!r}, expected a list of names or paths")
         for name in ("frame_file", "fiducial_frame_id"):
