@@ -59,7 +59,9 @@ class Registered:
 
     @property
     def messages(self) -> list[DiagnosticArray]:
-        by_stamp = {(one.header.stamp.sec, one.header.stamp.nanosec): one for one in self._heard}
+        # The status of the stream bears the time of its report.
+        of_images = [one for one in self._heard if one.status[0].name == "register_node: registration"]
+        by_stamp = {(one.header.stamp.sec, one.header.stamp.nanosec): one for one in of_images}
         return [message for (sec, _), message in by_stamp.items() if sec > 0]
 
     def wait(self, count: int, deadline_s: float = 60.0) -> list[dict[str, str]]:

@@ -44,8 +44,10 @@ class RegistrationAnswers:
         if message.header.stamp != self._stamp:
             return
         for status in message.status:
-            if status.name == NAME:
+            # Of several frames each has a status, under the same name and its own; the first stands for all.
+            if status.name.startswith(NAME):
                 self.count += 1
                 values = {one.key: one.value for one in status.values}
                 self._measured = values["calibration"] == "measured"
                 self._spacing = (float(values["pixel_spacing_x_mm"]), float(values["pixel_spacing_y_mm"]))
+                return
