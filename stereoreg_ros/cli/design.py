@@ -1,4 +1,4 @@
-"""`stereoreg design`: a frame with a small error at a target, that can be built and is never ambiguous."""
+"""`stereoreg design`: a frame with a small error at a target, that can be built, tried for ambiguous poses."""
 
 from __future__ import annotations
 

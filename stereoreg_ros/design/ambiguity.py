@@ -56,8 +56,9 @@ def trials(
             noisy = spots_px[lines] + options.spot_noise_px * rng.standard_normal((len(lines), 2))
             result = register_spots(noisy, frame, scale, options, slice_area_mm2=area_mm2)
             estimates = (result.estimate,) if result else result.estimates
-            explanations = [[match.line_index for match in sorted(one.matches, key=_spot)] for one in estimates]
-            spots = [[match.spot for match in sorted(one.matches, key=_spot)] for one in estimates]
+            by_spot = [sorted((match.spot, match.line_index) for match in one.matches) for one in estimates]
+            spots = [[spot for spot, _ in pairs] for pairs in by_spot]
+            explanations = [[line for _, line in pairs] for pairs in by_spot]
             right = bool(explanations) and list(lines[spots[0]]) == explanations[0]
             twins = []
             for estimate, put, on in zip(estimates, explanations, spots, strict=True):
@@ -75,7 +76,3 @@ def trials(
 def reasons(made: Sequence[Trial]) -> Counter[str]:
     """How often which outcome; `accepted` for those that were."""
     return Counter(trial.reason or "accepted" for trial in made)
-
-
-def _spot(match: object) -> int:
-    return int(getattr(match, "spot"))  # noqa: B009
