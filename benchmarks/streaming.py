@@ -9,44 +9,26 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 import numpy as np
-import psutil
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
-from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from tqdm import tqdm
 
-from benchmarks.slice_source import SCANNER, WARM_UP
+from benchmarks.answers import Answers, Listener
+from benchmarks.register_process import DEADLINE_S, Load, LoadMeter, RegisterProcess
+from benchmarks.slice_source import WARM_UP
 from benchmarks.yardstick import Yardstick
-from stereoreg_ros.nodes.diagnostic_status import NAME
 
 P50_Y, P99_Y = 8.0, 30.0
 RATE_HZ, FAST_HZ = 10.0, 30.0
-_DEEP: Final = QoSProfile(depth=1000)
-_READY: Final = "ready, frame"
-_DEADLINE_S: Final = 60.0
 _SILENCE_S: Final = 10.0
-_MIB: Final = 2**20
-
-
-@dataclass(frozen=True)
-class Load:
-    """What the node took of the machine over some time: CPU in % of a core, and its largest resident memory in MiB."""
-
-    cpu_percent: float
-    memory_mib: float
 
 
 @dataclass
@@ -68,109 +50,14 @@ class Stream:
     load: Load
 
 
-@dataclass
-class _Heard:
-    """When the answers to each stamp arrived, ns; and how long the node says it took, s."""
-
-    poses: dict[int, int] = field(default_factory=dict)
-    statuses: dict[int, int] = field(default_factory=dict)
-    inside_s: dict[int, float] = field(default_factory=dict)
-
-
-class _Listener(Node):
-    def __init__(self) -> None:
-        super().__init__("streaming_listener")
-        self.heard = _Heard()
-        self.create_subscription(PoseStamped, "pose", self._on_pose, _DEEP)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEEP)
-
-    def hears_the_node(self) -> bool:
-        """Whether both topics have a publisher."""
-        return self.count_publishers("pose") > 0 and self.count_publishers("/diagnostics") > 0
-
-    def _on_pose(self, message: PoseStamped) -> None:
-        self.heard.poses[_nanoseconds(message)] = time.time_ns()
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == NAME:
-                stamp = _nanoseconds(message)
-                self.heard.statuses[stamp] = time.time_ns()
-                values = {pair.key: pair.value for pair in status.values}
-                self.heard.inside_s[stamp] = 1e-3 * float(values["duration_ms"])
-
-
-def _nanoseconds(message: PoseStamped | DiagnosticArray) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
-
-
-class _RegisterNode:
-    """register_node as a process of its own; `ready_s`: from its start until it said that it was ready."""
-
-    def __init__(self, log: IO[bytes]) -> None:
-        scale = SCANNER.scale
-        self._log = log
-        begun = time.monotonic()
-        command = [sys.executable, "-m", "stereoreg_ros.nodes.register_node"]
-        command += ["--ros-args", "-p", f"pixel_spacing:=[{scale.sx}, {scale.sy}]"]
-        self._popen = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-        while _READY not in self.output:
-            if self._popen.poll() is not None or time.monotonic() > begun + _DEADLINE_S:
-                raise RuntimeError(f"register_node did not become ready:\n{self.output}")
-            time.sleep(0.01)
-        self.ready_s = time.monotonic() - begun
-        self.process = psutil.Process(self._popen.pid)
-
-    @property
-    def output(self) -> str:
-        descriptor = self._log.fileno()
-        return os.pread(descriptor, os.fstat(descriptor).st_size, 0).decode(errors="replace")
-
-    def end(self) -> None:
-        self._popen.send_signal(signal.SIGINT)
-        try:
-            self._popen.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            self._popen.kill()
-            self._popen.wait()
-
-
-class _LoadMeter:
-    """The load of a process from now on."""
-
-    def __init__(self, process: psutil.Process) -> None:
-        self._process = process
-        self._start = self._used(), time.monotonic()
-        self._largest = 0
-
-    def load(self) -> Load:
-        """Until now; memory is the most that was seen at any call."""
-        self._largest = max(self._largest, self._process.memory_info().rss)
-        used, begun = self._start
-        return Load(100 * (self._used() - used) / (time.monotonic() - begun), self._largest / _MIB)
-
-    def _used(self) -> float:
-        times = self._process.cpu_times()
-        return float(times.user + times.system)
-
-
-def _spin(listener: Node, until: Callable[[], bool], seconds: float) -> bool:
-    deadline = time.monotonic() + seconds
-    while not until():
-        if time.monotonic() > deadline:
-            return False
-        rclpy.spin_once(listener, timeout_sec=0.1)
-    return True
-
-
-def _stream(listener: _Listener, node: _RegisterNode, rate: float, slices: int) -> Stream:
+def _stream(listener: Listener, node: RegisterProcess, rate: float, slices: int) -> Stream:
     command = [sys.executable, "-m", "benchmarks.slice_source", "--rate", str(rate), "--slices", str(slices)]
-    heard = listener.heard = _Heard()
+    heard = listener.heard = Answers()
     source = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert source.stdout is not None
     # Until the slices begin, the source is drawing them.
-    _spin(listener, lambda: bool(heard.statuses) or source.poll() is not None, _DEADLINE_S)
-    meter = _LoadMeter(node.process)
+    listener.spin(lambda: bool(heard.statuses) or source.poll() is not None, DEADLINE_S)
+    meter = LoadMeter(node.process)
     answered, last_s, load = 0, time.monotonic(), meter.load()
     stamps: list[int] = []
     with tqdm(total=WARM_UP + slices, desc=f"{rate:g} Hz", unit="slice", disable=None, leave=False) as bar:
@@ -186,7 +73,7 @@ def _stream(listener: _Listener, node: _RegisterNode, rate: float, slices: int) 
                 if source.returncode or not stamps:
                     raise RuntimeError(f"the slice source ended with exit code {source.returncode}")
     # The pose of the last slice may come after its status.
-    _spin(listener, lambda: stamps[-1] in heard.poses, 1.0)
+    listener.spin(lambda: stamps[-1] in heard.poses, 1.0)
     latencies = np.array([1e-9 * (heard.poses[stamp] - stamp) for stamp in stamps if stamp in heard.poses])
     if latencies.size < 8:
         raise RuntimeError(f"only {latencies.size} of {len(stamps)} slices gave a pose:\n{node.output}")
@@ -236,14 +123,14 @@ def main() -> int:
     unit = Yardstick().unit()
     print(f"Y = {1e3 * unit:.2f} ms: threshold and connected components of a 512 x 512 slice")
     rclpy.init()
-    listener = _Listener()
+    listener = Listener("streaming_listener")
     with tempfile.TemporaryFile() as log:
-        node = _RegisterNode(log)
+        node = RegisterProcess(log)
         try:
-            if not _spin(listener, listener.hears_the_node, _DEADLINE_S):
-                raise RuntimeError(f"register_node was not discovered within {_DEADLINE_S:g} s")
-            meter = _LoadMeter(node.process)
-            _spin(listener, lambda: False, arguments.idle)
+            if not listener.spin(listener.hears_the_node, DEADLINE_S):
+                raise RuntimeError(f"register_node was not discovered within {DEADLINE_S:g} s")
+            meter = LoadMeter(node.process)
+            listener.spin(lambda: False, arguments.idle)
             idle = meter.load()
             print(
                 f"from start to ready {node.ready_s:.1f} s; idle: CPU {idle.cpu_percent:.1f} %, "
