@@ -5,6 +5,7 @@ SLICES ?= 30
 DEMO_OUTPUT ?= build/demo.png
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
+MINUTES ?= 60
 
 SHELL := bash
 # Not -u: colcon's setup.bash reads variables that nobody has set.
@@ -37,7 +38,7 @@ SOURCES := $(shell find stereoreg_ros config launch resource -name __pycache__ -
 WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; \
             source install/setup.bash;
 
-.PHONY: help venv demo test colcon-test matrix docs lint bench catphan dcmtk clean distclean
+.PHONY: help venv demo test colcon-test matrix docs lint bench soak catphan dcmtk clean distclean
 
 help:
 	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
@@ -48,6 +49,7 @@ help:
 	@echo 'make docs       the documentation as a site: build/docs/index.html'
 	@echo 'make lint       style and types'
 	@echo 'make bench      measurements'
+	@echo 'make soak       slices at 20 Hz for MINUTES=$(MINUTES): what is lost, whether memory or latency grows; build/soak/soak.png'
 	@echo 'make clean      remove what was built; make distclean: .venv and downloads too'
 	@echo 'PYTHON=python3.12 make venv   chooses the Python of a new .venv'
 
@@ -114,6 +116,9 @@ lint: $(INSTALLED)
 # On one core: matrices of six rods gain nothing from several.
 bench: venv
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 .venv/bin/python -m benchmarks $(BENCH_ARGS)
+
+soak: venv
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 .venv/bin/python -m benchmarks.soak --minutes $(MINUTES)
 
 clean:
 	rm -rf build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

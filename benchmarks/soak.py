@@ -1,14 +1,14 @@
 """`python -m benchmarks.soak`, `make soak`: slices at a steady rate for as long as told; what is lost, what grows?
 
 Scanner, node and listener are processes. Six rods and 24 false spots move through 512 x 512 pixels, now and then a
-slice shows no frame. Memory is what register_node has for itself (USS). Latency is from an image's stamp, taken just
-before it is published, to the arrival of its status here.
+slice shows no frame. Memory is what register_node holds that no file holds too, be it swapped out. Latency is from an
+image's stamp, taken just before it is published, to the arrival of its status here.
 
 The run is cut into windows of a minute, or of a twelfth of it where that is less. The first sixth, but no more than
 five minutes, is for warming up. Growth of the memory: from the first window after that to the highest later one, of
-the windows' medians, so that neither one sample nor what is taken and given back counts. The p99 is flat where, in
-units of the yardstick timed in the same window, that of the last sixth is at most FLAT times that of the first; a
-sixth's is the median of its windows', so that it is not other work on the machine for a minute that is judged.
+the windows' medians, as one sample says little. The p99 is flat where, in units of the yardstick timed in the same
+window, that of the last sixth is at most 1.5 times that of the first; a sixth's is the median of its windows', so that
+a minute of other work on the machine is not what is judged.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ from stereoreg_ros.nodes.stream_status import NAME as STREAM
 _PASSAGES: Final = 5
 _SAMPLE_S: Final = 2.0
 _SILENCE_S: Final = 10.0
-_MIB: Final = 2**20
 
 
 @dataclass
@@ -139,9 +138,8 @@ def _soak(listener: _SoakListener, node: RegisterProcess, rate: float, slices: i
                         raise RuntimeError(f"register_node has ended, or answers no more:\n{node.output}")
                     if time.monotonic() >= due_s:
                         due_s += _SAMPLE_S
-                        memory = node.process.memory_full_info()
-                        own = memory.uss + memory.swap
-                        samples.append(Sample(time.time_ns(), own / _MIB, memory.rss / _MIB, yardstick.once()))
+                        own, resident = node.memory_kib()
+                        samples.append(Sample(time.time_ns(), own / 1024, resident / 1024, yardstick.once()))
         finally:
             source.kill()
         said.seek(0)
@@ -154,7 +152,7 @@ def _soak(listener: _SoakListener, node: RegisterProcess, rate: float, slices: i
     return stamps, samples
 
 
-def _print(counts: Counts, windows: list[Window], verdict: Verdict) -> None:
+def _print_counts(counts: Counts) -> None:
     refused = ", ".join(f"{number} {reason}" for reason, number in counts.refused.items()) or "none"
     print(
         f"{counts.sent} slices sent, {counts.lost} lost, {counts.skipped} skipped; {counts.accepted} accepted, "
@@ -162,8 +160,12 @@ def _print(counts: Counts, windows: list[Window], verdict: Verdict) -> None:
     )
     print(
         f"{counts.wrong} wrong poses; largest error {counts.largest_error_mm:.2f} mm, "
-        f"{counts.largest_error_deg:.2f} degrees"
+        f"{counts.largest_error_deg:.2f} degrees",
+        flush=True,
     )
+
+
+def _print_verdict(windows: list[Window], verdict: Verdict) -> None:
     print(
         f"memory {windows[0].memory_mib:.2f} MiB in the first window, {verdict.warm_mib:.2f} MiB when warm, at most "
         f"{verdict.highest_mib:.2f} MiB after that: growth {verdict.growth_mb:+.3f} MB"
@@ -206,10 +208,16 @@ def main() -> int:
             listener.destroy_node()
             rclpy.shutdown()
     counts, answered = listener.counts(stamps), listener.heard.statuses
-    latencies_s = np.array([1e-9 * (answered[stamp] - stamp) for stamp in stamps if stamp in answered])
-    windows = windows_of(np.array([stamp for stamp in stamps if stamp in answered]), latencies_s, samples)
+    _print_counts(counts)
+    stamps = [stamp for stamp in stamps if stamp in answered]
+    latencies_s = np.array([1e-9 * (answered[stamp] - stamp) for stamp in stamps])
+    try:
+        windows = windows_of(np.array(stamps), latencies_s, samples)
+    except ValueError as error:
+        print(f"FAILED: {counts.lost} slices lost; {error}")
+        return 1
     verdict = verdict_of(windows, latencies_s)
-    _print(counts, windows, verdict)
+    _print_verdict(windows, verdict)
     arguments.output.mkdir(parents=True, exist_ok=True)
     record = {
         "minutes": arguments.minutes,

@@ -17,7 +17,7 @@ def draw_soak(samples: Sequence[Sample], windows: Sequence[Window], verdict: Ver
     begun = samples[0].at_ns
     minutes = [(sample.at_ns - begun) / 60e9 for sample in samples]
     middles = [(window.start_s + window.end_s) / 120 for window in windows]
-    memory.plot(minutes, [sample.memory_mib for sample in samples], ".", markersize=3, label="its own (USS)")
+    memory.plot(minutes, [sample.memory_mib for sample in samples], ".", markersize=3, label="not held by files")
     memory.plot(middles, [window.memory_mib for window in windows], color="tab:red", label="median of each window")
     memory.axvline(verdict.warm_s / 60, color="black", linestyle=":", label="warm")
     memory.set_ylabel("memory of register_node / MiB")

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.pose import Array
 
@@ -23,7 +24,7 @@ _MB_PER_MIB: Final = 1.048576
 
 @dataclass(frozen=True)
 class Sample:
-    """At one time (ns since the epoch): memory of the node alone, all that it has resident, and the yardstick."""
+    """At one time (ns since the epoch): the node's memory without what files hold, and with it; and the yardstick."""
 
     at_ns: int
     memory_mib: float
@@ -70,11 +71,13 @@ class Verdict:
         return missed
 
 
-def windows_of(stamps: Array, latencies_s: Array, samples: Sequence[Sample]) -> list[Window]:
+def windows_of(stamps: NDArray[np.int64], latencies_s: Array, samples: Sequence[Sample]) -> list[Window]:
     """Cut a run into windows; stamps (n,) ns and latencies_s (n,) of the slices answered, in order.
 
-    Raises ValueError where a window has no slice or no sample.
+    Raises ValueError where no slice was answered, or a window has no slice or no sample.
     """
+    if not stamps.size:
+        raise ValueError("no slice was answered")
     begun = stamps[0]
     slices_s = 1e-9 * (stamps - begun)
     samples_s = 1e-9 * np.array([sample.at_ns - begun for sample in samples])

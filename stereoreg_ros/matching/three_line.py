@@ -273,7 +273,8 @@ def _share_of_twins(frame: Frame, rods: int, sigma_mm: float) -> float:
 
 
 def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions, within_s: float) -> None:
-    """Fill the tables that most slices need, in which all rods show or all but one.
+    """Fill the tables that most slices need, in which all rods show or all but one; then those of slices without the
+    frame, for which the search goes down to the fewest rods.
 
     sigma_mm: of the spots' centres; within_s: seconds after which no further table is begun.
     """
@@ -293,11 +294,22 @@ def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions, within_
         plane_sample(frame, rods)
     for rods in range(least, most + 1):
         _may_have_twins(frame, rods, sigma_mm)
+    begun_at = most
+    for lines, complete_from in triple_order(frame, options.min_inliers):
+        # As `_Search` asks for them: with all that a triple has not been tried for, then level by level.
+        for ranges in ((begun_at, most), *((rods, rods) for rods in range(begun_at - 1, options.min_inliers - 1, -1))):
+            if time.monotonic() >= end_s:
+                return
+            _solver(frame, lines, _tolerance_mm(sigma_mm)).table(*ranges)
+        begun_at = min(begun_at, complete_from - 1)
 
 
 def _tolerance_mm(sigma_mm: float) -> float:
-    """How far noise may change a distance between two spots; in steps, so that few solvers serve all noises."""
-    return round(6.0 * sigma_mm + 0.05, 1)
+    """How far noise may change a distance between two spots; in steps, so that few solvers serve all noises.
+
+    Upwards: spots are known as well as the options say or a little less well, and the solvers prepared serve both.
+    """
+    return math.ceil(10 * (6.0 * sigma_mm + 0.05)) / 10
 
 
 @lru_cache(maxsize=64)
