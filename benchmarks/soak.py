@@ -49,8 +49,8 @@ _SILENCE_S: Final = 10.0
 class Counts:
     """What became of the slices; lost: never answered; poses_lost: said to be accepted, but no pose came.
 
-    skipped: answered, but not registered, for a newer one; wrong: poses off by more than what `make demo` allows, or of a
-    slice without a frame.
+    skipped: answered, but not registered, for a newer one; wrong: poses off by more than what `make demo` allows, or
+    of a slice without a frame.
     """
 
     sent: int = 0
