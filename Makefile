@@ -28,7 +28,7 @@ INSTALLED := .venv/.installed
 LINKED := .venv/.linked
 BUILT := install/.built
 CATPHAN := .cache/catphan/.complete
-DCMTK := .cache/.dcmtk
+DEBIAN := .cache/.debian
 
 EXECUTABLES := install/stereoreg_ros/lib/stereoreg_ros
 # Folders count too: theirs is the date that changes when a file is removed.
@@ -38,7 +38,7 @@ SOURCES := $(shell find stereoreg_ros config launch resource -name __pycache__ -
 WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; \
             source install/setup.bash;
 
-.PHONY: help venv demo test colcon-test matrix docs lint bench soak catphan dcmtk clean distclean
+.PHONY: help venv demo test colcon-test matrix docs lint bench soak catphan debian clean distclean
 
 help:
 	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
@@ -79,21 +79,24 @@ $(CATPHAN): test/fetch_catphan.py | $(INSTALLED)
 	.venv/bin/python test/fetch_catphan.py $(@D)
 	@touch $@
 
-dcmtk: $(DCMTK)
+debian: $(DEBIAN)
 
-# Real DICOM clients for the tests; where they cannot be installed, the tests that need them are skipped and say so.
-$(DCMTK):
+# For the tests: real DICOM clients, and ip, to make hosts of their own. Where they cannot be installed, the tests that need
+# them are skipped and say so.
+$(DEBIAN):
 	@mkdir -p $(@D)
-	@command -v storescu >/dev/null || { echo 'Installing dcmtk' && [ "$$(id -u)" = 0 ] && apt-get update -qq && \
-	    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends dcmtk >/dev/null; } || \
-	    echo 'make: dcmtk cannot be installed here, its clients are not tested with'
+	@for need in storescu:dcmtk ip:iproute2; do \
+	    command -v $${need%:*} >/dev/null || { echo "Installing $${need#*:}" && [ "$$(id -u)" = 0 ] && apt-get update -qq && \
+	    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $${need#*:} >/dev/null; } || \
+	    echo "make: $${need#*:} cannot be installed here, nothing is tested with it"; \
+	done
 	@touch $@
 
 demo: venv
 	@mkdir -p '$(dir $(DEMO_OUTPUT))'
 	$(WITH_ROS) $(EXECUTABLES)/demo_report --slices $(SLICES) --output '$(DEMO_OUTPUT)'
 
-test: venv catphan dcmtk
+test: venv catphan debian
 	$(WITH_ROS) .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile)
 
 # colcon test is content where no test ran.

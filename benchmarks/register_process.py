@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO, Final
 
 import psutil
@@ -48,18 +47,6 @@ class RegisterProcess:
     def running(self) -> bool:
         """Whether the process is alive."""
         return self._popen.poll() is None
-
-    def memory_kib(self) -> tuple[int, int]:
-        """What the process holds that no file holds too, in memory or swapped out; and all that it has in memory.
-
-        Its USS would not do: it goes up where another program that maps the same libraries ends.
-        """
-        kib = {}
-        for line in Path(f"/proc/{self._popen.pid}/status").read_text().splitlines():
-            name, _, value = line.partition(":")
-            if value.endswith(" kB"):
-                kib[name] = int(value.removesuffix(" kB"))
-        return kib["RssAnon"] + kib["RssShmem"] + kib["VmSwap"], kib["VmRSS"]
 
     def end(self) -> None:
         """By SIGINT, or where that does not help by SIGKILL."""

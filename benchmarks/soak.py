@@ -32,6 +32,7 @@ from tqdm import tqdm
 
 from benchmarks.answers import Listener, nanoseconds
 from benchmarks.pose_statistics import pose_error
+from benchmarks.process_memory import memory_kib
 from benchmarks.register_process import DEADLINE_S, RegisterProcess
 from benchmarks.slice_source import TRUTH_QOS, WARM_UP
 from benchmarks.soak_verdict import JUDGED_FROM_S, Sample, Verdict, Window, verdict_of, windows_of
@@ -129,7 +130,7 @@ def _soak(listener: _SoakListener, node: RegisterProcess, rate: float, slices: i
                         raise RuntimeError(f"register_node has ended, or answers no more:\n{node.output}")
                     if time.monotonic() >= due_s:
                         due_s += _SAMPLE_S
-                        own, resident = node.memory_kib()
+                        own, resident = memory_kib(node.process.pid)
                         samples.append(Sample(time.time_ns(), own / 1024, resident / 1024, yardstick.once()))
         finally:
             source.kill()

@@ -51,6 +51,7 @@ def association(
     called: str = TITLE,
     tls: ssl.SSLContext | None = None,
     sent: list[bytes] | None = None,
+    address: str = "127.0.0.1",
 ) -> Iterator[Association]:
     """An association, established or not, with the presentation contexts (SOP class, transfer syntaxes).
 
@@ -63,7 +64,7 @@ def association(
         client.add_requested_context(sop_class, syntaxes)
     sockets: list[socket.socket] = []
     opened = client.associate(
-        "127.0.0.1",
+        address,
         port,
         ae_title=called,
         tls_args=(tls, "localhost") if tls else None,

@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,13 +60,22 @@ def _python_of(script: Path) -> Path:
 
 
 class NodeProcess:
-    """A node that runs in a process group of its own, its output kept in a file."""
+    """A node that runs in a process group of its own, its output kept in a file.
 
-    def __init__(self, executable: str, *arguments: str, env: Mapping[str, str] | None = None) -> None:
+    within: what its command begins with, where it runs elsewhere than a test's own processes.
+    """
+
+    def __init__(
+        self,
+        executable: str,
+        *arguments: str,
+        env: Mapping[str, str] | None = None,
+        within: Sequence[str] = (),
+    ) -> None:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         self.name = executable
         self._process = subprocess.Popen(
-            [*command_of(executable), *arguments],
+            [*within, *command_of(executable), *arguments],
             cwd=REPOSITORY,
             env={**os.environ, **ROS_ENVIRONMENT, "PYTHONUNBUFFERED": "1", **(env or {})},
             stdin=subprocess.DEVNULL,
@@ -81,6 +90,11 @@ class NodeProcess:
         # Not by reading on from the file's position: the process writes at that very position.
         descriptor = self._log.fileno()
         return os.pread(descriptor, os.fstat(descriptor).st_size, 0).decode(errors="replace")
+
+    @property
+    def pid(self) -> int:
+        """Of the node, as whatever starts it gives way to it."""
+        return self._process.pid
 
     @property
     def running(self) -> bool:
@@ -114,9 +128,11 @@ class NodeProcess:
 
 
 @contextmanager
-def node_process(executable: str, *arguments: str, env: Mapping[str, str] | None = None) -> Iterator[NodeProcess]:
+def node_process(
+    executable: str, *arguments: str, env: Mapping[str, str] | None = None, within: Sequence[str] = ()
+) -> Iterator[NodeProcess]:
     """Run a node; at the end SIGINT must end it with exit code 0. On a failure its output is printed."""
-    process = NodeProcess(executable, *arguments, env=env)
+    process = NodeProcess(executable, *arguments, env=env, within=within)
     try:
         yield process
         if process.running:
