@@ -7,7 +7,7 @@ accepted, or refused with a reason.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,16 +39,17 @@ _IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
 _WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 0.5, 0.75
 
 
-def prepare(
-    frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None, within_s: float = math.inf
-) -> None:
-    """Fill the tables that most slices with `frame` need, in a second or two; else the first slices wait for them.
+def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:
+    """Fill the tables that slices with `frame` need; else the first slices wait for them. Takes long for many rods."""
+    for _ in preparation(frame, scale, options):
+        pass
 
-    within_s: seconds after which no further table is begun; frames of many rods have tables for minutes.
-    """
+
+def preparation(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> Iterator[None]:
+    """The same in small steps, for those who have other things to do; what most slices need comes first."""
     options = options or RegistrationOptions()
     if options.matcher == "three_line":
-        three_line.prepare(frame, _noise_mm(scale, options.spot_noise_px), options, within_s)
+        yield from three_line.preparation(frame, _noise_mm(scale, options.spot_noise_px), options)
 
 
 def register_slice(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
 from stereoreg_ros import RegistrationOptions, load_frame, register_slice
+from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.matching import three_line
 from stereoreg_ros.registration import prepare
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
@@ -21,20 +24,55 @@ def no_tables():
     three_line._solver.cache_clear()
 
 
-# Of less noise than that, it is the image that says how well a spot is known.
-@pytest.mark.parametrize("noise_px", [0.3, 0.45])
-def test_after_prepare_no_slice_waits_for_a_table(no_tables, monkeypatch, noise_px):
-    options, rng = RegistrationOptions(spot_noise_px=noise_px), np.random.default_rng(0)
-    there = PlacedFrame(FRAME, random_pose(rng, FRAME, SCANNER))
+def assert_no_slice_waits_for_a_table(monkeypatch, frame: Frame, options: RegistrationOptions) -> None:
+    rng = np.random.default_rng(0)
+    there = PlacedFrame(frame, random_pose(rng, frame, SCANNER))
     with_frame, without_frame = (render_slice(placed, SCANNER, rng) for placed in ([there], []))
-    prepare(FRAME, SCANNER.scale, options)
 
     def missed(*_: object) -> None:
         raise AssertionError("a table was not prepared")
 
     monkeypatch.setattr(three_lines._Table, "of", missed)
-    seen = register_slice(with_frame, FRAME, options)
+    seen = register_slice(with_frame, frame, options)
     assert seen
-    gone = register_slice(without_frame, FRAME, options, previous=seen.scanner_from_frame)
+    gone = register_slice(without_frame, frame, options, previous=seen.scanner_from_frame)
     assert not gone
     assert gone.reason == "no_consensus"
+
+
+# Of less noise than that, it is the image that says how well a spot is known.
+@pytest.mark.parametrize("noise_px", [0.3, 0.45])
+def test_once_prepared_no_slice_waits_for_a_table(no_tables, monkeypatch, noise_px):
+    options = RegistrationOptions(spot_noise_px=noise_px)
+    prepare(FRAME, SCANNER.scale, options)
+    assert_no_slice_waits_for_a_table(monkeypatch, FRAME, options)
+
+
+# The first node imports a parser of interface files that needs a module which Python is to lose.
+@pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
+    rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not there")
+    from rclpy.parameter import Parameter
+    from rclpy.signals import SignalHandlerOptions
+    from ros_process import ROS_ENVIRONMENT
+
+    from stereoreg_ros.nodes import register_node
+
+    monkeypatch.setattr(register_node, "_PREPARE_S", 0.0)
+    monkeypatch.setattr(register_node, "_SPARE_TIME_S", 0.01)
+    os.environ.update(ROS_ENVIRONMENT)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = register_node.RegisterNode()
+        scale = SCANNER.scale
+        node.set_parameters([Parameter("pixel_spacing", value=[scale.sx, scale.sy])])
+        few = three_line._solver.cache_info().currsize
+        for _ in range(1000):
+            if node._spare_time.is_canceled():
+                break
+            rclpy.spin_once(node, timeout_sec=0.1)
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert few < three_line._solver.cache_info().currsize
+    assert_no_slice_waits_for_a_table(monkeypatch, node.frame, RegistrationOptions())

@@ -8,7 +8,6 @@ to stop, is said here.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -52,6 +51,8 @@ _FEWEST, _LOOKS_AT_FOUR, _LOOKS = 4, 4, 3
 # From so many rods on, only of a frame of which more than such a share of so many slices has twins; these are poses of
 # no more than this chi-square, with spots known to so many mm or worse.
 _FEWEST_WITHOUT_TWINS, _MANY_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 0.25, 32, 20.0, 0.25
+# Solvers that are kept, of a few megabytes each.
+_SOLVERS = 64
 # Explanations that chance brings less often than this (log10) are not sought beside one that was found.
 _LOG10_RIVALS = -3.0
 
@@ -272,35 +273,34 @@ def _share_of_twins(frame: Frame, rods: int, sigma_mm: float) -> float:
     return twins / len(rotations) if len(rotations) else 1.0
 
 
-def prepare(frame: Frame, sigma_mm: float, options: RegistrationOptions, within_s: float) -> None:
-    """Fill the tables that most slices need, in which all rods show or all but one; then those of slices without the
-    frame, for which the search goes down to the fewest rods.
+def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> Iterator[None]:
+    """Fill the tables that slices need, some at each step.
 
-    sigma_mm: of the spots' centres; within_s: seconds after which no further table is begun.
+    First those for all rods or all but one; then those for slices without the frame, where the search goes down to the
+    fewest rods. sigma_mm: of the spots' centres.
     """
-    end_s = time.monotonic() + within_s
     most, least = len(frame), max(len(frame) - 1, options.min_inliers)
-    for lines, complete_from in triple_order(frame, options.min_inliers):
-        if time.monotonic() >= end_s:
-            return
+    order = triple_order(frame, options.min_inliers)
+    for lines, complete_from in order:
         solver = _solver(frame, lines, _tolerance_mm(sigma_mm))
         for range_of_rods in ((most, most), (least, most), (least, least)):
             solver.table(*range_of_rods)
+        yield
         if complete_from <= least:
             break
     for rods in range(options.min_inliers, most + 1):
-        if time.monotonic() >= end_s:
-            return
         plane_sample(frame, rods)
+        yield
     for rods in range(least, most + 1):
         _may_have_twins(frame, rods, sigma_mm)
+        yield
     begun_at = most
-    for lines, complete_from in triple_order(frame, options.min_inliers):
+    # Of frames of many rods only some: the rest is for spots that are known less well.
+    for lines, complete_from in order[: _SOLVERS // 2]:
         # As `_Search` asks for them: with all that a triple has not been tried for, then level by level.
         for ranges in ((begun_at, most), *((rods, rods) for rods in range(begun_at - 1, options.min_inliers - 1, -1))):
-            if time.monotonic() >= end_s:
-                return
             _solver(frame, lines, _tolerance_mm(sigma_mm)).table(*ranges)
+            yield
         begun_at = min(begun_at, complete_from - 1)
 
 
@@ -312,6 +312,6 @@ def _tolerance_mm(sigma_mm: float) -> float:
     return math.ceil(10 * (6.0 * sigma_mm + 0.05)) / 10
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=_SOLVERS)
 def _solver(frame: Frame, lines: tuple[int, int, int], tolerance_mm: float) -> ThreeLineSolver:
     return ThreeLineSolver(frame, lines, tolerance_mm, END_SLACK_MM, LEAST_COSINE)

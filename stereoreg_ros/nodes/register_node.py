@@ -6,7 +6,8 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -40,7 +41,7 @@ from stereoreg_ros.nodes.spinning import run
 from stereoreg_ros.nodes.stream_status import StreamStatus
 from stereoreg_ros.nodes.targets import TargetInFrame, status_of_target, target_in_frame
 from stereoreg_ros.nodes.transforms import broadcaster_of, has_tf2
-from stereoreg_ros.registration import prepare, register_frames
+from stereoreg_ros.registration import preparation, register_frames
 from stereoreg_ros.result import Reason, Refusal, Registration
 
 _LOOK_FOR_OVERDUE_S = 0.1
@@ -48,6 +49,8 @@ _REPORT_STREAM_S = 1.0
 _REPEAT_WARNING_S = 5.0
 # Longer, and whoever sets a parameter would wait too long for the answer.
 _PREPARE_S = 2.0
+_SPARE_TIME_S = 0.2
+_NOTHING = object()
 _TOPIC_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -63,6 +66,9 @@ class RegisterNode(Node):
         # They are there before a frame is, so that a controller can wait for them.
         self._topics = [FrameTopics(self)]
         self._outputs: list[FrameOutput] = []
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._preparation: Iterator[None] = iter(())
+        self._spare_time = self.create_timer(_SPARE_TIME_S, self._prepare_in_spare_time, clock=steady)
         self._frame_fault = self._load_start_frames()
         self._backlog = Backlog()
         self._slice_poses = SlicePoses()
@@ -80,7 +86,6 @@ class RegisterNode(Node):
         self._image_input = subscription_of(self, Image, "image", self._on_image, QUEUE)
         subscription_of(self, PointStamped, "target", self._on_target, QUEUE)
         self._more_wait = self.create_guard_condition(self._register_next)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=steady)
         self.create_timer(_REPORT_STREAM_S, self._report_stream, clock=steady)
         self._scale = ScaleKeeper(self, self)
@@ -338,9 +343,20 @@ class RegisterNode(Node):
 
     def _prepare(self) -> None:
         """Fill the tables that the first slices would wait for; until the scale is told nobody knows which."""
-        if self.settings.scale is not None:
-            for output in self._outputs:
-                prepare(output.frame, self.settings.scale, self.settings.options, _PREPARE_S)
+        if self.settings.scale is None:
+            return
+        scale, options = self.settings.scale, self.settings.options
+        self._preparation = chain.from_iterable(preparation(output.frame, scale, options) for output in self._outputs)
+        end_s = time.monotonic() + _PREPARE_S
+        for _ in self._preparation:
+            if time.monotonic() >= end_s:
+                self._spare_time.reset()
+                break
+
+    def _prepare_in_spare_time(self) -> None:
+        """Go on with what there was no time for, a few tables each time that no slice waits."""
+        if not len(self._backlog) and next(self._preparation, _NOTHING) is _NOTHING:
+            self._spare_time.cancel()
 
     def _choose_tf(self) -> None:
         if self.settings.publish_tf and self._send_transform is None:
