@@ -75,4 +75,6 @@ def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
     finally:
         rclpy.shutdown()
     assert few < three_line._solver.cache_info().currsize
+    # Tables are of one frame, as it was loaded.
+    assert node.frame is not None
     assert_no_slice_waits_for_a_table(monkeypatch, node.frame, RegistrationOptions())
