@@ -282,10 +282,9 @@ def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> 
     most, least = len(frame), max(len(frame) - 1, options.min_inliers)
     order = triple_order(frame, options.min_inliers)
     for lines, complete_from in order:
-        solver = _solver(frame, lines, _tolerance_mm(sigma_mm))
         for range_of_rods in ((most, most), (least, most), (least, least)):
-            solver.table(*range_of_rods)
-        yield
+            _solver(frame, lines, _tolerance_mm(sigma_mm)).table(*range_of_rods)
+            yield
         if complete_from <= least:
             break
     for rods in range(options.min_inliers, most + 1):
