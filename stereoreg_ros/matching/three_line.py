@@ -253,24 +253,52 @@ def _may_have_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:
     """
     if rods < _FEWEST_WITHOUT_TWINS:
         return True
-    # In steps, so that few are looked up.
-    return _share_of_twins(frame, rods, max(2.0 ** math.ceil(math.log2(sigma_mm)), _LEAST_SIGMA_MM)) > _MANY_TWINS
+    return _twin_sample(frame, rods, sigma_mm).share > _MANY_TWINS
+
+
+class _TwinSample:
+    """Typical slices that show so many rods, and how many of them have a second explanation of them all."""
+
+    def __init__(self, frame: Frame, rods: int, sigma_mm: float) -> None:
+        self._frame, self._rods, self._sigma_mm = frame, rods, sigma_mm
+        self._left = zip(*typical_slices(frame, rods, _TYPICAL_SLICES), strict=True)
+        self._rng = np.random.default_rng(0)
+        self._looked_at = self._twins = 0
+
+    @property
+    def share(self) -> float:
+        """Of those with twins; 1 where no slice shows so many rods."""
+        while self.look_at_next():
+            pass
+        return self._twins / self._looked_at if self._looked_at else 1.0
+
+    def look_at_next(self) -> bool:
+        """Look at one slice more; False where there is none."""
+        try:
+            rotation, translation, seen = next(self._left)
+        except StopIteration:
+            return False
+        shown = self._rng.permutation(np.flatnonzero(seen))[: self._rods]
+        points_mm = cut(self._frame, rotation, translation).points_mm[shown]
+        spots = Spots.of(points_mm, np.tile(self._sigma_mm**2 * np.eye(2), (self._rods, 1, 1)), None)
+        search = _Search(spots, self._frame, Prior(np.eye(3), math.pi), RegistrationOptions())
+        self._looked_at += 1
+        try:
+            near = [one for one in search.level(self._rods, math.inf, []) if one.chi_square < _NEAR_TWIN]
+            self._twins += len(distinct(near, spots.gains(self._frame))) > 1
+        except _TooMuchWorkError:
+            self._twins += 1  # For all that is known.
+        return True
+
+
+def _twin_sample(frame: Frame, rods: int, sigma_mm: float) -> _TwinSample:
+    """Of spots known so well or less; in steps, so that few are made."""
+    return _kept_twin_sample(frame, rods, max(2.0 ** math.ceil(math.log2(sigma_mm)), _LEAST_SIGMA_MM))
 
 
 @lru_cache(maxsize=64)
-def _share_of_twins(frame: Frame, rods: int, sigma_mm: float) -> float:
-    """Share of typical slices that show so many rods with a second explanation of them all; 1 where no slice does."""
-    rotations, translations, visible = typical_slices(frame, rods, _TYPICAL_SLICES)
-    options, rng = RegistrationOptions(), np.random.default_rng(0)
-    twins = 0
-    for rotation, translation, seen in zip(rotations, translations, visible, strict=True):
-        shown = rng.permutation(np.flatnonzero(seen))[:rods]
-        points_mm = cut(frame, rotation, translation).points_mm[shown]
-        spots = Spots.of(points_mm, np.tile(sigma_mm**2 * np.eye(2), (rods, 1, 1)), None)
-        search = _Search(spots, frame, Prior(np.eye(3), math.pi), options)
-        near = [one for one in search.level(rods, math.inf, []) if one.chi_square < _NEAR_TWIN]
-        twins += len(distinct(near, spots.gains(frame))) > 1
-    return twins / len(rotations) if len(rotations) else 1.0
+def _kept_twin_sample(frame: Frame, rods: int, sigma_mm: float) -> _TwinSample:
+    return _TwinSample(frame, rods, sigma_mm)
 
 
 def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> Iterator[None]:
@@ -290,9 +318,9 @@ def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> 
     for rods in range(options.min_inliers, most + 1):
         plane_sample(frame, rods)
         yield
-    for rods in range(least, most + 1):
-        _may_have_twins(frame, rods, sigma_mm)
-        yield
+    for rods in range(max(least, _FEWEST_WITHOUT_TWINS), most + 1):
+        while _twin_sample(frame, rods, sigma_mm).look_at_next():
+            yield
     begun_at = most
     # Of frames of many rods only some: the rest is for spots that are known less well.
     for lines, complete_from in order[: _SOLVERS // 2]:
