@@ -225,7 +225,9 @@ def test_slices_that_have_waited_too_long_are_skipped_for_the_newest_and_counted
         answers = [of_stamp(bench.diagnostics, one) for one in late]
         assert all(answers), "an image without an answer"
         reasons = [values_of(answer.status[0])["reason"] for answer in answers]
-        assert skipped() == reasons.count("skipped")
+        # On a busy computer, some of those before were skipped too.
+        heard = [values_of(one)["reason"] for one in statuses(bench.diagnostics, "register_node: registration")]
+        assert skipped() == heard.count("skipped")
         assert reasons[-1] != "skipped"
         last = values_of(statuses(bench.diagnostics, "register_node: stream")[-1])
         assert int(last["slices_received"]) == int(last["slices_registered"]) + int(last["slices_skipped"])
