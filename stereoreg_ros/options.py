@@ -73,7 +73,7 @@ class RegistrationOptions:
         if int(self.min_inliers) != self.min_inliers:
             raise ValueError(f"min_inliers is {self.min_inliers!r}, expected a whole number")
         if self.matcher not in MATCHERS:
-            raise ValueError(f"matcher is {self.matcher!r}, expected one of {', '.join(MATCHERS)}")
+            raise ValueError(f"matcher is {self.matcher!r:.200}, expected one of {', '.join(MATCHERS)}")
         if self.min_spot_area_mm2 >= self.max_spot_area_mm2:
             raise ValueError(
                 f"min_spot_area_mm2 is {self.min_spot_area_mm2:g}, expected less than "
@@ -117,7 +117,7 @@ def _checked_point(name: str, value: Any) -> tuple[float, float, float]:
         point = np.empty(0)
     if point.shape != (3,) or not (np.abs(point) <= _FARTHEST_MM).all():
         raise ValueError(
-            f"{name} is {value!r}, expected three numbers of mm from {-_FARTHEST_MM:g} to {_FARTHEST_MM:g}"
+            f"{name} is {value!r:.200}, expected three numbers of mm from {-_FARTHEST_MM:g} to {_FARTHEST_MM:g}"
         )
     return (float(point[0]), float(point[1]), float(point[2]))
 
@@ -132,4 +132,4 @@ def _check_ranges(options: RegistrationOptions | CalibrationOptions) -> None:
         number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
         if not number or not low <= value <= high:
             or_word = f", or '{word}'" if word else ""
-            raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}{or_word}")
+            raise ValueError(f"{entry.name} is {value!r:.200}, expected a number from {low:g} to {high:g}{or_word}")
