@@ -31,6 +31,8 @@ _KNOWING: Final = 0.7
 _AFRESH: Final = 0.4
 # Numbers go through these; to count their branches would only make them slow.
 _UNCOUNTED: Final = ["stereoreg_ros.matching", "stereoreg_ros.solvers", "stereoreg_ros.simulation"]
+# Longer ones are tried, but not changed again and again: they take long.
+_LONGEST_CHANGED: Final = 16384
 # A signal that ends the process is to be seen by the watcher.
 _SIGNALS: Final = ("segv", "bus", "abrt", "ill", "fpe")
 
@@ -77,10 +79,11 @@ def _run_own(attempts: _Attempts, kind: Kind, inputs: int, seed: int) -> None:
     """Inputs made from the known ones."""
     rng = random.Random(seed)
     known = _known(kind)
+    short = [data for data in known if len(data) <= _LONGEST_CHANGED]
     for data in known[:inputs]:
         attempts.try_input(data)
     for _ in range(inputs - len(known)):
-        attempts.try_input(kind.mutate(rng.choice(known), rng))
+        attempts.try_input(kind.mutate(rng.choice(short), rng))
 
 
 def _run_atheris(attempts: _Attempts, kind: Kind, inputs: int, seed: int, folder: Path) -> None:
@@ -93,10 +96,12 @@ def _run_atheris(attempts: _Attempts, kind: Kind, inputs: int, seed: int, folder
     for number, data in enumerate(known):
         (grown / f"known-{number}").write_bytes(data)
 
+    short = [data for data in known if len(data) <= _LONGEST_CHANGED]
+
     def mutated(data: bytes, most: int, number: int) -> bytes:
         rng = random.Random(number)
-        if rng.random() < _AFRESH:
-            data = rng.choice(known)
+        if rng.random() < _AFRESH or len(data) > _LONGEST_CHANGED:
+            data = rng.choice(short)
         if rng.random() < _KNOWING:
             changed: bytes = kind.mutate(data, rng)
         else:

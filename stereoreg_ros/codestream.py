@@ -71,6 +71,8 @@ def require_rle_size(codestream: bytes, pixels: int) -> None:
     A packet of two bytes stands for up to 128: a decoder that only compares afterwards takes sixty times the memory.
     """
     count, *offsets = _RLE_HEADER.unpack(codestream[: _RLE_HEADER.size].ljust(_RLE_HEADER.size, b"\0"))
+    if not 1 <= count <= len(offsets):
+        raise ValueError(f"an RLE image has {count} segments, expected 1 to {len(offsets)}")
     starts = offsets[:count]
     for start, end in zip(starts, [*starts[1:], len(codestream)], strict=True):
         segment = codestream[start:end]

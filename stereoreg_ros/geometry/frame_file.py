@@ -32,13 +32,14 @@ def load_frame(source: str | os.PathLike[str]) -> Frame:
         shipped = shipped_frames()
         if path.name not in shipped:
             raise FrameFileError(
-                f"frame '{source}' is neither a file nor a shipped frame; shipped are: {', '.join(sorted(shipped))}"
+                f"frame '{os.fspath(source):.200}' is neither a file nor a shipped frame; "
+                f"shipped are: {', '.join(sorted(shipped))}"
             )
         path = shipped[path.name]
     try:
         root = compose(read_whole(path, MOST_BYTES))
     except OSError as error:
-        raise FrameFileError(f"{path}: cannot be read: {error.strerror}, expected a frame file") from None
+        raise FrameFileError(f"{path!s:.1000}: cannot be read: {error.strerror}, expected a frame file") from None
     except UnusableYamlError as error:
         where = f", line {error.line}" if error.line else ""
         raise FrameFileError(f"{path}{where}: {error.problem}") from None
