@@ -28,11 +28,11 @@ _HANGS: Final = 88
 # Of the inputs that the engine of atheris asks for, so many are changed by what knows the kind, the others by its own.
 _KNOWING: Final = 0.7
 # And so many begin again with an input that was there at the start: what reaches new branches drifts away from sense.
-_AFRESH: Final = 0.4
+_AFRESH: Final = 0.6
 # Numbers go through these; to count their branches would only make them slow.
 _UNCOUNTED: Final = ["stereoreg_ros.matching", "stereoreg_ros.solvers", "stereoreg_ros.simulation"]
-# Longer ones are tried, but not changed again and again: they take long.
-_LONGEST_CHANGED: Final = 16384
+# Longer ones are tried, but not changed again and again: they take long. Valid ones may be of any length.
+_LONGEST_CHANGED: Final = 4096
 # A signal that ends the process is to be seen by the watcher.
 _SIGNALS: Final = ("segv", "bus", "abrt", "ill", "fpe")
 
@@ -75,11 +75,16 @@ def _known(kind: Kind) -> list[bytes]:
     return kind.seeds() + [path.read_bytes() for path in kind.found]
 
 
+def _short(known: list[bytes], kind: Kind) -> list[bytes]:
+    most = max(_LONGEST_CHANGED, *map(len, kind.seeds()))
+    return [data for data in known if len(data) <= most]
+
+
 def _run_own(attempts: _Attempts, kind: Kind, inputs: int, seed: int) -> None:
     """Inputs made from the known ones."""
     rng = random.Random(seed)
     known = _known(kind)
-    short = [data for data in known if len(data) <= _LONGEST_CHANGED]
+    short = _short(known, kind)
     for data in known[:inputs]:
         attempts.try_input(data)
     for _ in range(inputs - len(known)):
@@ -96,11 +101,12 @@ def _run_atheris(attempts: _Attempts, kind: Kind, inputs: int, seed: int, folder
     for number, data in enumerate(known):
         (grown / f"known-{number}").write_bytes(data)
 
-    short = [data for data in known if len(data) <= _LONGEST_CHANGED]
+    short = _short(known, kind)
+    longest = max(map(len, short))
 
     def mutated(data: bytes, most: int, number: int) -> bytes:
         rng = random.Random(number)
-        if rng.random() < _AFRESH or len(data) > _LONGEST_CHANGED:
+        if rng.random() < _AFRESH or len(data) > longest:
             data = rng.choice(short)
         if rng.random() < _KNOWING:
             changed: bytes = kind.mutate(data, rng)
