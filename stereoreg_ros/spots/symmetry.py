@@ -56,7 +56,7 @@ def centres_of_symmetry(
     for _ in range(_STEPS):
         compared = _compared(patches, centres, window, shut)
         centres = centres + np.clip(compared.step, -0.5, 0.5)
-    inverse = _inverse(compared.information + np.eye(2) * 1e-12)
+    inverse = _inverse(_regular(compared.information))
     height = np.abs(patches).max(axis=(1, 2))
     variance = _moderated(compared.variance, noise_hu2, height)
     covariances = variance[:, None, None] * (inverse @ compared.by_noise @ inverse)
@@ -136,7 +136,7 @@ def _compared(patches: Array, centres: Array, window: Array, shut: NDArray[np.bo
     information[:, 1, 1] = np.einsum("nij,nij->n", weighted_v, slope_v)
     information[:, 0, 1] = information[:, 1, 0] = np.einsum("nij,nij->n", weighted_u, slope_v)
     pull = np.stack([np.einsum("nij,nij->n", part, odd) for part in (weighted_u, weighted_v)], axis=-1)
-    step = -0.5 * np.linalg.solve(information + 1e-9 * np.eye(2), pull[..., None])[..., 0]
+    step = -0.5 * np.linalg.solve(_regular(information), pull[..., None])[..., 0]
     # Between pixels the noise of the mirror image is less than a pixel's. Each pair of pixels counts twice, and the
     # centre takes two pairs' worth.
     noise = 1.0 + (mirror_v**2).sum(axis=2)[:, :, None] * (mirror_u**2).sum(axis=2)[:, None, :]
@@ -169,6 +169,13 @@ def _spline_coefficients(side: int) -> Array:
     basis = 2 / 3 * np.eye(side) + 1 / 6 * (np.eye(side, k=1) + np.eye(side, k=-1))
     basis[0, 1] = basis[-1, -2] = 1 / 3  # mirrored at both ends
     return _inverse(basis)
+
+
+def _regular(information: Array) -> Array:
+    """Information (n, 2, 2) that can be inverted where a spot has slopes in one direction only, or none."""
+    least = 1e-12 * np.trace(information, axis1=1, axis2=2) + 1e-12
+    regular: Array = information + least[:, None, None] * np.eye(2)
+    return regular
 
 
 def _inverse(matrices: Array) -> Array:
