@@ -184,6 +184,8 @@ class _Search:
                 yield from self._settled(starts.take(slice(first, first + _CHUNK)))
 
     def _settled(self, starts: Starts) -> Iterator[Hypothesis]:
+        if not len(starts.origin):
+            return
         for hypothesis in settle(self._spots, self._frame, starts, self._options.min_inliers):
             if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
                 yield hypothesis
