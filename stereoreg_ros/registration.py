@@ -25,6 +25,7 @@ from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots, Streaks
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
+from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
 from stereoreg_ros.spots import FoundSpots, find_spots
 from stereoreg_ros.uncertainty import checked_scale_covariance, in_scanner_axes, scale_sensitivity
 
@@ -309,6 +310,9 @@ def _estimate(
     spots = hypothesis.spot_of_line[lines]
     distances = point_line_distances(frame, lines, slice_from_frame, scale.to_mm(spots_px[spots]))
     covariance = _covariance(hypothesis.information)
+    if _is_weak(covariance):
+        whitening = np.linalg.inv(np.linalg.cholesky(scale.matrix @ weighted_px2[spots] @ scale.matrix.T))
+        covariance = covariance_along_valley(frame, slice_from_frame, lines, scale.to_mm(spots_px[spots]), whitening)
     if scale_covariance is not None:
         by_scale = scale_sensitivity(frame, lines, slice_from_frame, spots_px[spots], weighted_px2[spots], scale)
         covariance = covariance + by_scale @ scale_covariance @ by_scale.T
@@ -322,6 +326,16 @@ def _estimate(
         ),
         chi_square=hypothesis.chi_square,
         log10_false_alarms=hypothesis.log10_false_alarms,
+    )
+
+
+def _is_weak(covariance: Array) -> bool:
+    """Whether the pose is determined so weakly that the curvature at the solution does not tell how weakly."""
+    position = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    rotation_deg = math.degrees(math.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    # What is not determined at all has no end to walk to, and is refused.
+    return rotation_deg < _DEGENERATE_ROTATION_DEG and (
+        position > _WEAK_POSITION_MM or rotation_deg > _WEAK_ROTATION_DEG
     )
 
 

@@ -15,7 +15,9 @@ from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.uncertainty import error_ball_95, point_covariance
 
-Reason = Literal["too_few_spots", "no_consensus", "ambiguous", "degenerate", "inaccurate", "bad_image", "bad_frame"]
+Reason = Literal[
+    "too_few_spots", "no_consensus", "ambiguous", "degenerate", "inaccurate", "bad_image", "bad_frame", "skipped"
+]
 REASONS: Final[tuple[Reason, ...]] = (
     "too_few_spots",
     "no_consensus",
@@ -24,6 +26,7 @@ REASONS: Final[tuple[Reason, ...]] = (
     "inaccurate",
     "bad_image",
     "bad_frame",
+    "skipped",
 )
 
 

@@ -12,8 +12,10 @@ def numbered(count: int) -> list[Image]:
 
 
 def taken(backlog: Backlog, now_s: float) -> list[int]:
+    """Numbers of the images that are registered."""
+    backlog.take_late(now_s)
     numbers = []
-    while (image := backlog.take(now_s)) is not None:
+    while (image := backlog.take()) is not None:
         numbers.append(image.height)
     return numbers
 
@@ -30,6 +32,7 @@ def test_newest_alone_once_one_has_waited_too_long() -> None:
     backlog = Backlog()
     for image in numbered(5):
         backlog.add(image, 100.0 + 0.1 * image.height)
+    assert [image.height for image in backlog.take_late(100.0 + 1.1 * MOST_WAIT_S)] == [0, 1, 2, 3]
     assert taken(backlog, 100.0 + 1.1 * MOST_WAIT_S) == [4]
     assert (backlog.received, backlog.skipped) == (5, 4)
 

@@ -27,6 +27,15 @@ def clutter_of(rng: np.random.Generator) -> np.ndarray:
     return hu
 
 
+def wait_until_running(bench: Bench) -> None:
+    """Until the node has taken up a call of `recalibrate`: requests of several clients come in any order."""
+
+    def running() -> bool:
+        return "running" in bench.client.call(Trigger, f"{bench.node}/reset_calibration").message
+
+    bench.client.wait_for(running, "the recalibration to run")
+
+
 @pytest.fixture
 def client():
     with RosClient("console") as console:
@@ -65,6 +74,7 @@ def test_slices_are_registered_meanwhile_and_a_second_call_is_refused(client):
         service = client.node.create_client(Trigger, f"{bench.node}/recalibrate")
         client.wait_for(service.service_is_ready, "the service")
         first = service.call_async(Trigger.Request())
+        wait_until_running(bench)
         second = client.call(Trigger, f"{bench.node}/recalibrate")
         assert not second.success
         assert "running already" in second.message
@@ -89,7 +99,7 @@ def test_a_search_does_not_keep_the_node_from_ending(client):
         service = client.node.create_client(Trigger, f"{bench.node}/recalibrate")
         client.wait_for(service.service_is_ready, "the service")
         first = service.call_async(Trigger.Request())
-        assert "running" in client.call(Trigger, f"{bench.node}/reset_calibration").message
+        wait_until_running(bench)
         assert not first.done()
         code, seconds = process.stop(signal.SIGTERM)
         assert code == 0

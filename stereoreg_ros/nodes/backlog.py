@@ -30,20 +30,18 @@ class Backlog:
         self.received += 1
         self._waiting.append((image, received_s))
 
-    def take(self, now_s: float) -> Image | None:
-        """The image whose turn it is, None where none waits: the oldest, or the newest where that has waited too long.
-
-        Those that are passed over count as skipped.
-        """
-        if not self._waiting:
-            return None
+    def take_late(self, now_s: float) -> list[Image]:
+        """The images that are skipped, in order: all but the newest where the oldest has waited too long."""
         # A clock that was set back makes no slice old.
-        if len(self._waiting) > 1 and now_s - self._waiting[0][1] > MOST_WAIT_S:
-            self.skipped += len(self._waiting) - 1
-            newest = self._waiting.pop()
-            self._waiting.clear()
-            return newest[0]
-        return self._waiting.popleft()[0]
+        if not self._waiting or now_s - self._waiting[0][1] <= MOST_WAIT_S:
+            return []
+        late = [self._waiting.popleft()[0] for _ in range(len(self._waiting) - 1)]
+        self.skipped += len(late)
+        return late
+
+    def take(self) -> Image | None:
+        """The image whose turn it is, None where none waits."""
+        return self._waiting.popleft()[0] if self._waiting else None
 
 
 def waiting_in(subscription: Subscription) -> Iterator[tuple[Image, float]]:

@@ -30,7 +30,7 @@ from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.nodes import conversions
-from stereoreg_ros.nodes.backlog import Backlog, received_s, waiting_in
+from stereoreg_ros.nodes.backlog import MOST_WAIT_S, Backlog, received_s, waiting_in
 from stereoreg_ros.nodes.by_stamp import WAIT_S, ByStamp
 from stereoreg_ros.nodes.conversions import MessageError
 from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING, status_of, status_of_unusable
@@ -125,7 +125,9 @@ class RegisterNode(Node):
         """One slice, and then it is the turn of services, parameters and timers before the next."""
         for image, came_s in waiting_in(self._image_input):
             self._backlog.add(image, came_s)
-        image = self._backlog.take(time.time())
+        for late in self._backlog.take_late(time.time()):
+            self._skip(late)
+        image = self._backlog.take()
         if image is not None:
             self._pair(image)
         if len(self._backlog):
@@ -232,8 +234,18 @@ class RegisterNode(Node):
         for output, result in zip(self._outputs, results, strict=True):
             output.publish(result, header, came_s, self._axes_of(output.frame), self._send_transform)
         self._publish_statuses(statuses, header)
+        self._count(header)
         self._publish_target_in_frame()
         self._publish_pictures(ct_slice, results, header)
+
+    def _skip(self, image: Image) -> None:
+        """Answer an image that is not registered, since newer ones wait; the latest pose stays as it is."""
+        # Left behind, these might be taken for those of a later image with its stamp.
+        self._slice_spacings.take(image.header.stamp)
+        self._slice_poses.take(image.header.stamp)
+        message = f"skipped for a newer slice: it had waited for over {MOST_WAIT_S:g} s"
+        statuses = self._unusable("skipped", message, image.header.frame_id, 0.0)
+        self._publish_statuses(statuses, image.header)
 
     def _slice_from(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError) -> Slice:
         image, spacing = unregistered.image, unregistered.spacing
@@ -259,8 +271,14 @@ class RegisterNode(Node):
         self.get_logger().warning(f"image refused: {message}", throttle_duration_sec=_REPEAT_WARNING_S)
         for output in self._outputs:
             output.latest = None
+        statuses = self._unusable(reason, message, header.frame_id, time.perf_counter() - started)
+        self._publish_statuses(statuses, header)
+        self._count(header)
+
+    def _unusable(self, reason: Reason, message: str, hardware_id: str, duration_s: float) -> list[DiagnosticStatus]:
+        """Statuses, one for each frame, of an image that does not come to registration."""
         frames = [(output.frame.name, len(output.frame)) for output in self._outputs]
-        statuses = [
+        return [
             status_of_unusable(
                 reason,
                 message,
@@ -268,12 +286,11 @@ class RegisterNode(Node):
                 lines=lines,
                 pixel_spacing=self.settings.pixel_spacing,
                 calibration=self._scale.source,
-                duration_s=time.perf_counter() - started,
-                hardware_id=header.frame_id,
+                duration_s=duration_s,
+                hardware_id=hardware_id,
             )
             for name, lines in frames or [(source, 0) for source in self.settings.frame_sources]
         ]
-        self._publish_statuses(statuses, header)
 
     def _publish_statuses(self, statuses: list[DiagnosticStatus], header: Header) -> None:
         if len(statuses) > 1:
@@ -282,6 +299,9 @@ class RegisterNode(Node):
                 status.name = f"{status.name} of {frame}"
         # The image's stamp, so that a status can be laid beside its pose.
         self._diagnostics.publish(DiagnosticArray(header=Header(stamp=header.stamp), status=statuses))
+
+    def _count(self, header: Header) -> None:
+        """Count a slice that was answered, with its latency."""
         stamp = Time.from_msg(header.stamp, clock_type=self.get_clock().clock_type)
         latency_ms = (self.get_clock().now() - stamp).nanoseconds / 1e6 if stamp.nanoseconds else float("nan")
         self._stream.registered(time.monotonic(), latency_ms)

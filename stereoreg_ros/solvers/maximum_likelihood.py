@@ -69,9 +69,9 @@ def refine(
     """
     m = len(rotations)
     target = np.where(used[..., None], spots_mm, 0.0)
-    state = _evaluate(frame, rotations, translations, target, used, whitening)
+    state = evaluate(frame, rotations, translations, target, used, whitening)
     # Where poses at rest are written to; the others go on among themselves.
-    ended = _State(*(part.copy() for part in state))
+    ended = Evaluated(*(part.copy() for part in state))
     converged = np.zeros(m, dtype=bool)
     whitening = np.broadcast_to(whitening, (m, len(frame), 2, 2))
     rows, damping = np.arange(m), np.full(m, _FIRST_DAMPING)
@@ -82,7 +82,7 @@ def refine(
         diagonal += damping[:, None] * diagonal + (1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-12)
         step: Array = np.linalg.solve(damped, state.gradient[..., None])[..., 0].astype(np.float64, copy=False)
         turned = rotation_exp(step[:, 3:]) @ state.rotations
-        tried = _evaluate(frame, turned, state.translations + step[:, :3], target, used, whitening)
+        tried = evaluate(frame, turned, state.translations + step[:, :3], target, used, whitening)
         old = state.chi_square
         # A pose that loses a cut has NaN here, which is not better.
         better = tried.chi_square <= old
@@ -102,7 +102,7 @@ def refine(
             going = ~resting
             rows, damping, target, used = rows[going], damping[going], target[going], used[going]
             whitening = whitening[going]
-            state = _State(*(part[going] for part in state))
+            state = Evaluated(*(part[going] for part in state))
     cuts = cut(frame, ended.rotations, ended.translations)
     return Refined(ended.rotations, ended.translations, ended.chi_square, ended.information, converged, cuts)
 
@@ -142,7 +142,7 @@ def solve_maximum_likelihood(
     return [solution for _, solution in found]
 
 
-class _State(NamedTuple):
+class Evaluated(NamedTuple):
     """Poses (m, 3, 3), (m, 3) mm with chi-square (m,), J'J (m, 6, 6) and J'r (m, 6) of their whitened residuals r."""
 
     rotations: Array
@@ -151,9 +151,9 @@ class _State(NamedTuple):
     information: Array
     gradient: Array
 
-    def replaced(self, other: _State, rows: NDArray[np.bool_]) -> _State:
+    def replaced(self, other: Evaluated, rows: NDArray[np.bool_]) -> Evaluated:
         """These poses, but in the given rows those of another state."""
-        return _State(
+        return Evaluated(
             *(
                 np.where(rows.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
                 for new, old in zip(other, self, strict=True)
@@ -161,14 +161,15 @@ class _State(NamedTuple):
         )
 
 
-def _evaluate(
+def evaluate(
     frame: Frame,
     rotations: Array,
     translations: Array,
     target: Array,
     used: NDArray[np.bool_],
     whitening: Array,
-) -> _State:
+) -> Evaluated:
+    """Chi-square and its slope at poses slice_from_frame; arguments as in `refine`, without its broadcasting."""
     m, n = used.shape
     cuts = cut(frame, rotations, translations)
     mask = used[..., None]
@@ -178,4 +179,4 @@ def _evaluate(
     flat = np.where(mask[..., None], jacobian, 0.0).reshape(m, 2 * n, 6)
     turned = np.swapaxes(flat, 1, 2)
     chi_square = np.einsum("mki,mki->m", residual, residual)
-    return _State(rotations, translations, chi_square, turned @ flat, (turned @ residual)[..., 0])
+    return Evaluated(rotations, translations, chi_square, turned @ flat, (turned @ residual)[..., 0])

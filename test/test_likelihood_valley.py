@@ -1,0 +1,117 @@
+"""The covariance of weakly determined poses against the errors of simulated ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_spots
+from stereoreg_ros.design.meeting import meetings
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array, Pose
+from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
+from stereoreg_ros.solvers.maximum_likelihood import refine
+
+SCALE = PixelScale(0.5, 0.5)
+ALL_SIX = np.arange(6)
+
+
+def four_rods(seed: int) -> Frame:
+    rng = np.random.default_rng(seed)
+    starts, ends = rng.uniform(-30, 30, (2, 4, 3))
+    starts[:, 2], ends[:, 2] = -30, 30
+    return Frame("four", tuple("abcd"), starts, ends, np.ones(4))
+
+
+def solved(frame: Frame, true: Pose, spots_px: Array, noise_px: float) -> tuple[Pose, Array, Array]:
+    """The maximum-likelihood pose that is reached from the truth, its information, and the whitening."""
+    whitening = np.tile(SCALE.inverse_matrix / noise_px, (len(frame), 1, 1))
+    spots, used = SCALE.to_mm(spots_px)[None], np.ones((1, len(frame)), dtype=bool)
+    found = refine(frame, true.rotation[None], true.translation[None], spots, used, whitening[None], 1000)
+    assert found.converged[0]
+    return Pose(found.rotations[0], found.translations[0]), found.information[0], whitening
+
+
+def squared_error(found: Pose, true: Pose, covariance: Array) -> float:
+    turned = Rotation.from_matrix(found.rotation @ true.rotation.T).as_rotvec()
+    error = np.concatenate([found.translation - true.translation, turned])
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+@pytest.mark.parametrize("noise_px", [1e-3, 0.03])
+def test_of_a_straight_valley_it_is_the_inverse_of_the_information(noise_px):
+    frame, pose = load_frame("cube6"), Pose(np.eye(3), np.array([40.0, 50.0, 4.0]))
+    spots_px, _ = project(frame, pose, SCALE)
+    _, information, whitening = solved(frame, pose, spots_px, noise_px)
+    covariance = covariance_along_valley(frame, pose, ALL_SIX, SCALE.to_mm(spots_px), whitening)
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-15)
+    # The sum over the steps of the walk is the integral to within two percent.
+    shares = np.linalg.eigvals(covariance @ information).real
+    np.testing.assert_allclose(shares, 1.0, atol=0.02)
+
+
+def test_of_four_rods_it_is_the_mean_squared_error():
+    """Over even poses, as it supposes. The inverse of the information holds no more than the bottom of the valley."""
+    along, at_bottom = [], []
+    for seed in (100, 104, 105, 106):
+        frame, rng = four_rods(seed), np.random.default_rng(seed)
+        poses = meetings(150, seed, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
+        for row in range(len(poses)):
+            true = poses.pose(row)
+            spots_px, cuts = project(frame, true, SCALE)
+            if not cuts.inside.all():
+                continue
+            noisy = spots_px + 0.3 * rng.standard_normal(spots_px.shape)
+            found, information, whitening = solved(frame, true, noisy, 0.3)
+            at_solution = np.linalg.inv(information)
+            if not 0.75 < np.degrees(np.sqrt(np.linalg.eigvalsh(at_solution[3:, 3:])[-1])) < 10:
+                continue
+            covariance = covariance_along_valley(frame, found, np.arange(4), SCALE.to_mm(noisy), whitening)
+            at_bottom.append(squared_error(found, true, at_solution))
+            along.append(squared_error(found, true, covariance))
+    count = len(along)
+    assert count > 400
+    # Of a chi-square of six degrees of freedom, three standard errors.
+    assert np.mean(along) == pytest.approx(6.0, abs=3 * np.sqrt(12 / count))
+    # Beyond the 99.995 % point: hardly any, while at the bottom of the valley alone it is one in a hundred.
+    assert np.mean(np.array(along) > 30) <= 1 / 200
+    assert np.mean(np.array(at_bottom) > 30) > 1 / 100
+
+
+def test_the_registration_states_it():
+    """A pose of a four-rod frame at which the bottom of the valley tells too little."""
+    frame, rng = four_rods(100), np.random.default_rng(3)
+    poses = meetings(60, 3, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
+    options = RegistrationOptions(max_log10_false_alarms=-4.0)
+    ratios = []
+    for row in range(len(poses)):
+        spots_px, cuts = project(frame, poses.pose(row), SCALE)
+        if not cuts.inside.all():
+            continue
+        noisy = spots_px + 0.3 * rng.standard_normal(spots_px.shape)
+        result = register_spots(noisy, frame, SCALE, options, slice_area_mm2=65536.0)
+        if not result or not result.caution:
+            continue
+        estimate = result.estimate
+        lines = np.array([match.line_index for match in estimate.matches])
+        spots_mm = SCALE.to_mm(np.array([match.spot_px for match in estimate.matches]))
+        whitening = np.tile(SCALE.inverse_matrix / 0.3, (len(lines), 1, 1))
+        stated = covariance_along_valley(frame, estimate.slice_from_frame, lines, spots_mm, whitening)
+        np.testing.assert_allclose(estimate.covariance, stated, rtol=1e-6, atol=1e-12)
+        _, information, _ = solved(frame, estimate.slice_from_frame, noisy[np.argsort(lines)], 0.3)
+        ratios.append(np.trace(stated[3:, 3:]) / np.trace(np.linalg.inv(information)[3:, 3:]))
+    assert max(ratios) > 1.5
+
+
+def test_a_valley_without_an_end_gives_what_is_seen_of_it():
+    """Rods at right angles to the slice fix no height."""
+    starts = np.array([[0.0, 0, -30], [40, 0, -30], [0, 40, -30], [40, 45, -30]])
+    frame = Frame("pins", tuple("abcd"), starts, starts + np.array([0, 0, 60]), np.ones(4))
+    pose = Pose(np.eye(3), np.array([50.0, 50.0, 0.0]))
+    spots_px, _ = project(frame, pose, SCALE)
+    whitening = np.tile(SCALE.inverse_matrix / 0.3, (4, 1, 1))
+    covariance = covariance_along_valley(frame, pose, np.arange(4), SCALE.to_mm(spots_px), whitening)
+    assert np.isfinite(covariance).all()
+    assert covariance[2, 2] > 100.0**2
