@@ -24,6 +24,8 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
 from kill_rounds import WRONG_DEG, WRONG_MM, KillRounds, Tally, Victim
 from ros_process import RosClient
 
+_SHOWN = 20
+
 
 def main() -> int:
     """Print what was seen; 1 where a promise was broken."""
@@ -72,8 +74,10 @@ def _print(tally: Tally, seconds: float) -> None:
         ("promises broken", len(tally.faults)),
     ):
         print(f"{what:60s} {value!s:>8s}")
-    for fault in tally.faults:
+    for fault in tally.faults[:_SHOWN]:
         print(f"BROKEN: {fault}")
+    if len(tally.faults) > _SHOWN:
+        print(f"and {len(tally.faults) - _SHOWN} more")
 
 
 if __name__ == "__main__":
