@@ -5,6 +5,8 @@ SLICES ?= 30
 DEMO_OUTPUT ?= build/demo.png
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
+INPUTS ?= 10000
+FUZZ_ARGS ?=
 
 SHELL := bash
 # Not -u: colcon's setup.bash reads variables that nobody has set.
@@ -37,7 +39,7 @@ SOURCES := $(shell find stereoreg_ros config launch resource -name __pycache__ -
 WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; \
             source install/setup.bash;
 
-.PHONY: help venv demo test colcon-test matrix docs lint bench catphan dcmtk clean distclean
+.PHONY: help venv demo test colcon-test matrix docs lint bench fuzz catphan dcmtk clean distclean
 
 help:
 	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
@@ -48,6 +50,7 @@ help:
 	@echo 'make docs       the documentation as a site: build/docs/index.html'
 	@echo 'make lint       style and types'
 	@echo 'make bench      measurements'
+	@echo 'make fuzz       hostile input of every kind; INPUTS=$(INPUTS) of each, FUZZ_ARGS="frame dicom --seed 1" to choose'
 	@echo 'make clean      remove what was built; make distclean: .venv and downloads too'
 	@echo 'PYTHON=python3.12 make venv   chooses the Python of a new .venv'
 
@@ -114,6 +117,11 @@ lint: $(INSTALLED)
 # On one core: matrices of six rods gain nothing from several.
 bench: venv
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 .venv/bin/python -m benchmarks $(BENCH_ARGS)
+
+# Findings are laid into test/corpus, where the tests try them again.
+fuzz: venv
+	export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST OPENBLAS_NUM_THREADS=1; \
+	    .venv/bin/python -m fuzzing $(FUZZ_ARGS) --inputs $(INPUTS)
 
 clean:
 	rm -rf build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -12,15 +14,25 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
+from stereoreg_ros.bounded_yaml import MOST_BYTES, UnusableYamlError, compose, shown
 from stereoreg_ros.calibration import Calibration
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.uncertainty import checked_scale_covariance
-from stereoreg_ros.whole_file import sync_folder, write_whole
+from stereoreg_ros.whole_file import read_whole, sync_folder, write_whole
 
 _KIND: Final = "stereoreg_ros pixel scale"
-_MOST_BYTES: Final = 65536
+# More than a file of ours has anywhere.
+_DEEPEST: Final = 4
+_LONGEST_SCALAR: Final = 200
+_MOST_COUNTED: Final = 10**9
+# Of a pixel; also of a standard error, whose square then is a number.
+_LARGEST_MM: Final = 100.0
+# Recalibration changes a spacing by half at most.
+_LARGEST_FACTOR: Final = 2.0
 # Two spacings that differ by less are the same one, as a share.
 _SAME: Final = 1e-6
+_TAG: Final = "tag:yaml.org,2002:"
+_WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 
 
 class CalibrationFileError(ValueError):
@@ -107,32 +119,94 @@ def remove_calibration(path: Path) -> None:
 def load_calibration(path: Path) -> CalibrationRecord | None:
     """What the file says; None where there is none. Raises CalibrationFileError where it cannot be used."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(_MOST_BYTES + 1)
+        root = compose(read_whole(path, MOST_BYTES))
+        content = None if root is None else _value_of(root, 0, set())
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise CalibrationFileError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if len(raw) > _MOST_BYTES:
-        raise CalibrationFileError(f"{path}: larger than {_MOST_BYTES} bytes, expected a calibration file")
-    try:
-        content = yaml.safe_load(raw.decode("utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
-        raise CalibrationFileError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+        raise CalibrationFileError(
+            f"{path}: cannot be read: {error.strerror or error}, expected a calibration file"
+        ) from None
+    except UnusableYamlError as error:
+        where = f"line {error.line}: " if error.line else ""
+        raise CalibrationFileError(f"{path}: not YAML: {where}{error.problem}") from None
     if not isinstance(content, dict) or content.get("kind") != _KIND:
         found = content.get("kind") if isinstance(content, dict) else type(content).__name__
-        raise CalibrationFileError(f"{path}: kind is {found!r}, expected {_KIND!r}")
+        raise CalibrationFileError(f"{path}: kind is {shown(repr(found))}, expected {_KIND!r}")
     scale, old = _scale(path, content, "pixel"), _scale(path, content, "configured_pixel")
+    for new, before in ((scale.sx, old.sx), (scale.sy, old.sy)):
+        if not 1 / _LARGEST_FACTOR <= new / before <= _LARGEST_FACTOR:
+            raise CalibrationFileError(
+                f"{path}: pixel_spacing is {[scale.sx, scale.sy]}, expected {[old.sx, old.sy]}, the "
+                f"configured_pixel_spacing, changed by a factor of {_LARGEST_FACTOR:g} at most"
+            )
     covariance = _covariance(path, content)
     texts = {key: content.get(key) for key in ("frame", "date", "software")}
     counts = {key: content.get(key) for key in ("slices", "rods")}
     for key, value in texts.items():
-        if not isinstance(value, str):
-            raise CalibrationFileError(f"{path}: {key} is {value!r}, expected a text")
+        # Names and dates go into messages, which take no half of a surrogate pair.
+        if not isinstance(value, str) or not value.isprintable():
+            raise CalibrationFileError(f"{path}: {key} is {shown(repr(value))}, expected a text in one line")
     for key, value in counts.items():
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise CalibrationFileError(f"{path}: {key} is {value!r}, expected a number of 1 or more")
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MOST_COUNTED:
+            raise CalibrationFileError(f"{path}: {key} is {shown(repr(value))}, expected a number of 1 or more")
     return CalibrationRecord(scale, old, covariance, **counts, **texts)  # type: ignore[arg-type]
+
+
+def _whole(text: str) -> int:
+    if not _WHOLE.fullmatch(text):
+        raise ValueError
+    return int(text)
+
+
+def _real(text: str) -> float:
+    # Python spells infinity and NaN without the point.
+    return float(re.sub(r"\.(inf|nan)", r"\1", text.lower()))
+
+
+_SCALARS: Final[dict[str, Callable[[str], Any]]] = {
+    "str": str,
+    "int": _whole,
+    "float": _real,
+    "bool": lambda text: yaml.SafeLoader.bool_values[text.lower()],
+    "null": lambda _: None,
+}
+
+
+def _value_of(node: yaml.Node, level: int, seen: set[int]) -> Any:
+    """What a node says: a mapping with texts as keys, a list, a text, a number, true or false, or nothing.
+
+    PyYAML's own constructors let the second of two equal keys win and raise nearly anything on values that do not fit
+    their tags; aliases of aliases say more than any message could repeat.
+    """
+    line = node.start_mark.line + 1
+    kind = str(node.tag).removeprefix(_TAG)
+    if level > _DEEPEST:
+        raise UnusableYamlError(f"is nested more than {_DEEPEST} levels deep, expected fewer", line)
+    if id(node) in seen:
+        raise UnusableYamlError("repeats a value by an alias, expected none", line)
+    seen.add(id(node))
+    if isinstance(node, yaml.MappingNode) and kind == "map":
+        entries: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key = _value_of(key_node, level + 1, seen)
+            if not isinstance(key, str):
+                raise UnusableYamlError(f"a key is {shown(repr(key))}, expected a text", line)
+            if key in entries:
+                raise UnusableYamlError(f"key '{shown(key)}' comes a second time", line)
+            entries[key] = _value_of(value_node, level + 1, seen)
+        return entries
+    if isinstance(node, yaml.SequenceNode) and kind == "seq":
+        return [_value_of(one, level + 1, seen) for one in node.value]
+    convert = _SCALARS.get(kind)
+    if convert is None or not isinstance(node, yaml.ScalarNode):
+        raise UnusableYamlError(f"found a value of type {shown(kind)}, expected texts, numbers and lists", line)
+    if len(node.value) > _LONGEST_SCALAR:
+        raise UnusableYamlError(f"a value has {len(node.value)} characters, expected {_LONGEST_SCALAR} at most", line)
+    try:
+        return convert(node.value)
+    except (ValueError, KeyError):
+        raise UnusableYamlError(f"'{shown(node.value)}' is not of type {shown(kind)}", line) from None
 
 
 def _scale(path: Path, content: dict[str, Any], which: str) -> PixelScale:
@@ -146,6 +220,10 @@ def _scale(path: Path, content: dict[str, Any], which: str) -> PixelScale:
 
 def _covariance(path: Path, content: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
     errors = _numbers(path, content, "standard_errors", 2, 3)
+    if not all(0 <= error <= _LARGEST_MM for error in errors):
+        raise CalibrationFileError(
+            f"{path}: standard_errors is {list(errors)}, expected numbers of mm/pixel from 0 to {_LARGEST_MM:g}"
+        )
     size = len(errors)
     if "covariance" not in content:
         # Older files have the standard errors alone. Whatever the correlations of k numbers are, their covariance is in
@@ -154,7 +232,9 @@ def _covariance(path: Path, content: dict[str, Any]) -> tuple[tuple[float, ...],
         return tuple(tuple(float(value) for value in row) for row in np.diag(variances))
     rows = content["covariance"]
     if not isinstance(rows, list) or len(rows) != size:
-        raise CalibrationFileError(f"{path}: covariance is {rows!r}, expected {size} rows of {size} finite numbers")
+        raise CalibrationFileError(
+            f"{path}: covariance is {shown(repr(rows))}, expected {size} rows of {size} finite numbers"
+        )
     covariance = tuple(_numbers(path, {"covariance": row}, "covariance", size) for row in rows)
     try:
         checked_scale_covariance(covariance)
@@ -175,5 +255,5 @@ def _numbers(path: Path, content: dict[str, Any], key: str, *counts: int) -> tup
     )
     if not isinstance(values, list) or not numbers or len(values) not in counts:
         expected = " or ".join(str(count) for count in counts)
-        raise CalibrationFileError(f"{path}: {key} is {values!r}, expected {expected} finite numbers")
+        raise CalibrationFileError(f"{path}: {key} is {shown(repr(values))}, expected {expected} finite numbers")
     return tuple(float(one) for one in values)

@@ -10,10 +10,17 @@ _JPEG_START: Final = b"\xff\xd8"
 _JPEG_2000_START: Final = b"\xff\x4f\xff\x51"
 # Length and capabilities; then size and offset of the image, size and offset of a tile, number of components.
 _JPEG_2000_SIZE: Final = struct.Struct(">HH8IH")
+_JPEG_2000_FILE: Final = b"\0\0\0\x0cjP  \r\n\x87\n"
+_JPEG_2000_BOX: Final = struct.Struct(">I4s")
 _JPEG_FRAME: Final = struct.Struct(">HBHHB")
 # Start of frame of every process of JPEG, and of JPEG-LS; among them are three markers that mean something else.
 _JPEG_FRAME_MARKERS: Final = ({*range(0xC0, 0xD0)} | {0xF7}) - {0xC4, 0xC8, 0xCC}
 _MARKER_PREFIX: Final = 0xFF
+# Number of segments, and where each begins.
+_RLE_HEADER: Final = struct.Struct("<16I")
+_RLE_NOTHING: Final = 128
+# So many bytes behind a segment are harmless.
+_RLE_PADDING: Final = 256
 _ALONE: Final = {0x01, *range(0xD0, 0xDA)}
 
 
@@ -33,14 +40,57 @@ def size_of(codestream: bytes) -> CodestreamSize:
     """Size of a JPEG, JPEG-LS or JPEG 2000 image; ValueError where it does not say it as it should."""
     if codestream.startswith(_JPEG_START):
         return _jpeg(codestream)
-    start = codestream.find(_JPEG_2000_START)
-    if start < 0:
+    # A JPEG 2000 file, which is not allowed for but is met, has other boxes before the image, and might hide another.
+    start = _in_boxes(codestream) if codestream.startswith(_JPEG_2000_FILE) else 0
+    if not codestream.startswith(_JPEG_2000_START, start):
         raise ValueError("found the start of no JPEG and of no JPEG 2000 image")
     try:
         _, _, x, y, left, top, _, _, _, _, components = _JPEG_2000_SIZE.unpack_from(codestream, start + 4)
     except struct.error:
         raise ValueError("a JPEG 2000 image ends before its size") from None
     return CodestreamSize(y - top, x - left, components)
+
+
+def _in_boxes(file: bytes) -> int:
+    """Where the codestream begins in the boxes of a JPEG 2000 file."""
+    place = 0
+    while place + _JPEG_2000_BOX.size <= len(file):
+        length, kind = _JPEG_2000_BOX.unpack_from(file, place)
+        if kind == b"jp2c":
+            return place + _JPEG_2000_BOX.size
+        # Of a box of 0 bytes, which goes on to the end, or one with its length elsewhere, no scanner makes use.
+        if length < _JPEG_2000_BOX.size:
+            break
+        place += length
+    raise ValueError("a JPEG 2000 file holds no image")
+
+
+def require_rle_size(codestream: bytes, pixels: int) -> None:
+    """ValueError where a segment of an RLE image unpacks to many more bytes than there are pixels.
+
+    A packet of two bytes stands for up to 128: a decoder that only compares afterwards takes sixty times the memory.
+    """
+    count, *offsets = _RLE_HEADER.unpack(codestream[: _RLE_HEADER.size].ljust(_RLE_HEADER.size, b"\0"))
+    if not 1 <= count <= len(offsets):
+        raise ValueError(f"an RLE image has {count} segments, expected 1 to {len(offsets)}")
+    starts = offsets[:count]
+    for start, end in zip(starts, [*starts[1:], len(codestream)], strict=True):
+        segment = codestream[start:end]
+        length = place = 0
+        while place < len(segment) and length <= 2 * pixels + _RLE_PADDING:
+            packet = segment[place]
+            if packet < _RLE_NOTHING:
+                length += packet + 1
+                place += packet + 2
+            elif packet > _RLE_NOTHING:
+                length += 257 - packet
+                place += 2
+            else:
+                # Each takes its time, and no encoder has many.
+                length += 1
+                place += 1
+        if place < len(segment):
+            raise ValueError(f"an RLE segment unpacks to more than twice the {pixels} bytes of {pixels} pixels")
 
 
 def _jpeg(codestream: bytes) -> CodestreamSize:

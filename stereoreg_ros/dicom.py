@@ -20,7 +20,7 @@ import pydicom
 from numpy.typing import NDArray
 from pydicom.datadict import dictionary_description, tag_for_keyword
 from pydicom.dataset import FileMetaDataset
-from pydicom.filereader import read_dataset
+from pydicom.filereader import read_dataset, read_file_meta_info
 from pydicom.filewriter import write_file_meta_info
 from pydicom.uid import (
     UID,
@@ -31,12 +31,15 @@ from pydicom.uid import (
     RLELossless,
 )
 
-from stereoreg_ros.codestream import CodestreamSize, size_of
+from stereoreg_ros.codestream import CodestreamSize, require_rle_size, size_of
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation
-from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.slice import LARGEST_HU, PixelScale, Slice
 from stereoreg_ros.multiframe import single_frame, single_frames
+from stereoreg_ros.whole_file import read_whole
 
 MAX_SIDE_PX: Final = 8192
+# Of a file on the disk. What comes over the network has a bound of its own.
+_MAX_INFLATED_BYTES: Final = 2**30
 
 _FOLDER: Final = "a folder"
 _NO_LETTERS: Final = "not a DICOM file: found no letters DICM at byte 128"
@@ -44,6 +47,7 @@ _AXES_TOLERANCE: Final = 1e-3
 _SAME_POSITION_MM: Final = 1e-3
 _SAME_SPACING: Final = 1e-4
 _MONOCHROME: Final = ("MONOCHROME2", "MONOCHROME1")
+_LONGEST_TEXT: Final = 500
 # Preamble and letters; then the length of the file meta information, itself an element of twelve bytes.
 _META_START: Final = 132
 _META_LENGTH: Final = struct.Struct("<8sI")
@@ -194,18 +198,19 @@ def _read_placed(name: Path, dataset: pydicom.Dataset) -> DicomSlice:
     is_ct = _value(name, dataset, "SOPClassUID") in (CTImageStorage, EnhancedCTImageStorage)
     if is_ct and _value(name, dataset, "RescaleSlope") is None:
         raise _fault(name, "RescaleSlope", None, "that of a CT image")
-    _require_codestream_size(header, dataset)
     return DicomSlice(header, Slice(_read_hu(header, dataset), header.scale, header.scanner_from_slice))
 
 
-def _require_codestream_size(header: SliceHeader, dataset: pydicom.Dataset) -> None:
+def _require_codestream_size(header: SliceHeader, dataset: pydicom.Dataset, syntax: UID) -> None:
     """A decoder goes by what the compressed image says, whatever the object says."""
-    with _pydicom(header.path, f"{_tag('TransferSyntaxUID')} cannot be read"):
-        syntax = UID(str(dataset.file_meta.TransferSyntaxUID))
-        if not syntax.is_encapsulated or syntax == RLELossless:
+    with _pydicom(header.path, f"{_tag('TransferSyntaxUID')} is {syntax}, expected one of images"):
+        if not syntax.is_encapsulated:
             return
     with _pydicom(header.path, f"{_tag('PixelData')} cannot be decoded"):
-        size = size_of(single_frame(dataset))
+        codestream = single_frame(dataset)
+        if syntax == RLELossless:
+            return require_rle_size(codestream, header.rows * header.columns)
+        size = size_of(codestream)
     if size != CodestreamSize(header.rows, header.columns, 1):
         raise DicomError(
             header.path,
@@ -309,7 +314,15 @@ def _read_dataset(file: Path, *, stop_before_pixels: bool) -> pydicom.Dataset:
     what = _not_dicom(file)
     if what is not None:
         raise DicomError(file, f"{what}, expected a DICOM file")
-    return _parse(file, file, stop_before_pixels=stop_before_pixels)
+    with _pydicom(file, "is damaged, expected file meta information (group 0002)"):
+        deflated = read_file_meta_info(file).get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian
+    if not deflated:
+        return _parse(file, file, stop_before_pixels=stop_before_pixels)
+    try:
+        content = read_whole(file, _MAX_INFLATED_BYTES)
+    except OSError as error:
+        raise DicomError(file, f"cannot be read: {error.strerror}") from error
+    return _parse(file, BytesIO(_inflated(file, content, _MAX_INFLATED_BYTES)), stop_before_pixels=stop_before_pixels)
 
 
 def _parse(file: Path, source: Path | BytesIO, *, stop_before_pixels: bool) -> pydicom.Dataset:
@@ -402,8 +415,8 @@ def _read_hu(header: SliceHeader, dataset: pydicom.Dataset) -> NDArray[np.float3
             raise DicomError(file, f"every pixel has a {_tag('PixelPaddingValue')}, expected an image")
         # Padding may stand for any HU, also for one above the threshold: it must not look like metal.
         hu[padding] = hu[~padding].min()
-    if not np.abs(hu).max() < np.finfo(np.float32).max:
-        raise DicomError(file, f"HU reach {np.abs(hu).max():g}, expected numbers that fit float32")
+    if not np.abs(hu).max() <= LARGEST_HU:
+        raise DicomError(file, f"HU reach {np.abs(hu).max():g}, expected {LARGEST_HU:g} at most")
     return hu.astype(np.float32)
 
 
@@ -427,7 +440,9 @@ def _read_stored(header: SliceHeader, dataset: pydicom.Dataset) -> NDArray[Any]:
     if syntax is None:
         raise _fault(file, "TransferSyntaxUID", None, "that of the pixel data")
     with _pydicom(file, "Transfer Syntax UID (0002,0010) cannot be read"):
-        name = UID(str(syntax)).name
+        uid = UID(str(syntax))
+        name = uid.name
+    _require_codestream_size(header, dataset, uid)
     with _pydicom(
         file,
         f"{_tag('PixelData')} cannot be decoded: {len(data)} bytes in transfer syntax {name} (0002,0010), "
@@ -519,8 +534,13 @@ def _tag(keyword: str) -> str:
 
 
 def _fault(file: Path, keyword: str, found: object, expected: str) -> DicomError:
-    state = "is missing" if found is None else f"is {found!r}"
+    state = "is missing" if found is None else f"is {_shortened(repr(found))}"
     return DicomError(file, f"{_tag(keyword)} {state}, expected {expected}")
+
+
+def _shortened(text: str) -> str:
+    """Text that may repeat what an object holds, however long that is."""
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
 @contextmanager
@@ -532,7 +552,7 @@ def _pydicom(file: Path, problem: str) -> Iterator[None]:
             yield
         # It raises nearly anything then, struct.error and AttributeError among it.
         except Exception as error:
-            cause = " ".join(str(error).split()) or type(error).__name__
+            cause = _shortened(" ".join(str(error).split())) or type(error).__name__
             raise DicomError(file, f"{problem}: {cause}") from error
 
 

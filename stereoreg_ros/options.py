@@ -72,8 +72,8 @@ class RegistrationOptions:
         _check_ranges(self)
         if int(self.min_inliers) != self.min_inliers:
             raise ValueError(f"min_inliers is {self.min_inliers!r}, expected a whole number")
-        if self.matcher not in MATCHERS:
-            raise ValueError(f"matcher is {self.matcher!r}, expected one of {', '.join(MATCHERS)}")
+        if not isinstance(self.matcher, str) or self.matcher not in MATCHERS:
+            raise ValueError(f"matcher is {self.matcher!r:.200}, expected one of {', '.join(MATCHERS)}")
         if self.min_spot_area_mm2 >= self.max_spot_area_mm2:
             raise ValueError(
                 f"min_spot_area_mm2 is {self.min_spot_area_mm2:g}, expected less than "
@@ -81,7 +81,7 @@ class RegistrationOptions:
             )
         try:
             rotation_from_quaternion(self.nominal_orientation)
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             raise ValueError(f"nominal_orientation: {error}") from None
         object.__setattr__(self, "target_in_frame_mm", _checked_point("target_in_frame_mm", self.target_in_frame_mm))
         object.__setattr__(self, "min_inliers", int(self.min_inliers))
@@ -117,7 +117,7 @@ def _checked_point(name: str, value: Any) -> tuple[float, float, float]:
         point = np.empty(0)
     if point.shape != (3,) or not (np.abs(point) <= _FARTHEST_MM).all():
         raise ValueError(
-            f"{name} is {value!r}, expected three numbers of mm from {-_FARTHEST_MM:g} to {_FARTHEST_MM:g}"
+            f"{name} is {value!r:.200}, expected three numbers of mm from {-_FARTHEST_MM:g} to {_FARTHEST_MM:g}"
         )
     return (float(point[0]), float(point[1]), float(point[2]))
 
@@ -127,9 +127,9 @@ def _check_ranges(options: RegistrationOptions | CalibrationOptions) -> None:
         low, high = entry.metadata["low"], entry.metadata["high"]
         value = getattr(options, entry.name)
         word = entry.metadata["word"]
-        if low is None or (word is not None and value == word):
+        if low is None or (word is not None and isinstance(value, str) and value == word):
             continue
         number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
         if not number or not low <= value <= high:
             or_word = f", or '{word}'" if word else ""
-            raise ValueError(f"{entry.name} is {value!r}, expected a number from {low:g} to {high:g}{or_word}")
+            raise ValueError(f"{entry.name} is {value!r:.200}, expected a number from {low:g} to {high:g}{or_word}")

@@ -1,8 +1,10 @@
-"""Files that are either the old one or the new one, whole, whatever happens meanwhile."""
+"""Files written so that they are the old one or the new one, whole, whatever happens meanwhile; and read as a whole."""
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 import tempfile
 from pathlib import Path
 
@@ -20,6 +22,28 @@ def write_whole(path: Path, content: str | bytes) -> None:
         Path(temporary).unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def read_whole(path: Path, most_bytes: int) -> bytes:
+    """The content of a regular file; OSError where it cannot be read, is larger, or is a pipe or a device.
+
+    Those would be waited for, or never end.
+    """
+    try:
+        # An open of a pipe does not wait for the other end then.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    except ValueError as error:
+        raise OSError(errno.EINVAL, f"no name of a file: {error}") from None
+    with open(descriptor, "rb") as file:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "not a regular file")
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise OSError(errno.EFBIG, f"longer than {most_bytes} bytes")
+    return content
 
 
 def sync_folder(folder: Path) -> None:

@@ -17,7 +17,9 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # What each part may import of the package, itself apart. A part that is not listed is at the rim: all but nodes.
 MAY_IMPORT: dict[str, set[str]] = {
-    "geometry": set(),
+    "bounded_yaml": set(),
+    "whole_file": set(),
+    "geometry": {"bounded_yaml", "whole_file"},
     "options": {"geometry"},
     "spots": {"geometry", "options"},
     "solvers": {"geometry"},
@@ -25,7 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "simulation": {"geometry"},
     "multiframe": set(),
     "codestream": set(),
-    "dicom": {"geometry", "multiframe", "codestream"},
+    "dicom": {"geometry", "multiframe", "codestream", "whole_file"},
     "reception": {"geometry", "dicom"},
     "matching": {"geometry", "options", "solvers"},
     "result": {"geometry", "options", "uncertainty"},

@@ -165,7 +165,7 @@ def content() -> dict[str, object]:
         ("\xff\xfe", "kind is"),
         ("!!python/object/apply:os.system [true]", "not YAML"),
         ("name: cube6\nlines: []\n", "kind is None, expected"),
-        ("a" * 70000, "larger than 65536 bytes"),
+        ("a" * 70000, "longer than 65536 bytes"),
         ({"kind": "other"}, "kind is 'other'"),
         ({"pixel_spacing": [0.5]}, r"pixel_spacing is \[0.5\], expected 2 finite numbers"),
         ({"pixel_spacing": [0.5, float("nan")]}, "pixel_spacing is .*, expected 2 finite numbers"),
@@ -178,6 +178,19 @@ def content() -> dict[str, object]:
         ({"covariance": [[1e-6, 1e-7], [0.0, 1e-6]]}, "covariance: .*, expected a finite and symmetric matrix"),
         ({"covariance": [[1e-6, 2e-6], [2e-6, 1e-6]]}, "covariance: .*, expected no negative variance"),
         ({"covariance": [[1e-6, 0.0], [0.0, 4e-6]]}, "covariance has the variances .*, expected the squares of the"),
+        (
+            {"covariance": [[1e-6, 0.0], [0.0, 1e-6]], "standard_errors": [-0.001, 0.001]},
+            "expected numbers of mm/pixel",
+        ),
+        (
+            {"covariance": None, "standard_errors": [1e200, 1e200]},
+            "standard_errors is .*, expected numbers of mm/pixel",
+        ),
+        ({"pixel_spacing": [0.5, 1.1]}, r"pixel_spacing is \[0.5, 1.1\], expected \[0.5, 0.5\], .* by a factor of 2"),
+        ({"pixel_spacing": [10**400, 0.5]}, "not YAML: line [0-9]+: a value has 401 characters, expected 200 at most"),
+        ({"slices": 10**10}, "slices is 10000000000, expected a number of 1 or more"),
+        ({"frame": "a\ud800"}, "frame is 'a\\\\ud800', expected a text in one line"),
+        ({"date": "a\nb"}, "expected a text in one line"),
         ({"slices": 0}, "slices is 0, expected a number of 1 or more"),
         ({"frame": 3}, "frame is 3, expected a text"),
     ],
@@ -188,6 +201,46 @@ def test_broken_file_is_named(tmp_path: Path, text: str | dict[str, object], sen
     with pytest.raises(CalibrationFileError, match=sentence) as caught:
         load_calibration(path)
     assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    ("found", "sentence"),
+    [
+        ("slices: !!int ''", "'' is not of type int"),
+        ("slices: !!bool maybe", "'maybe' is not of type bool"),
+        ("slices: !!float x", "'x' is not of type float"),
+        ("slices: !!timestamp x", "found a value of type timestamp"),
+        ("slices: !!python/name:os.system", "found a value of type .*python/name:os.system, expected texts, numbers"),
+        ("slices: 2001-01-01", "found a value of type timestamp"),
+        ("slices: " + "1:" * 60 + "1.5", "is not of type float"),
+        ("slices: 0x" + "f" * 190, "is not of type int"),
+        ("slices: 3\nslices: 4", "key 'slices' comes a second time"),
+        ("slices: 3\n3: 4", "a key is 3, expected a text"),
+        ("slices: &a [*a]", "repeats a value by an alias, expected none"),
+        ("slices: [[[[[[1]]]]]]", "is nested more than 4 levels deep"),
+        ("slices: [" + "1," * 5000 + "1]", "holds more than 4000 values"),
+    ],
+)
+def test_values_that_break_constructors_are_named(tmp_path: Path, found: str, sentence: str) -> None:
+    path = tmp_path / "scale.yaml"
+    path.write_text(yaml.safe_dump(content(), sort_keys=False).replace("slices: 3", found), encoding="utf-8")
+    with pytest.raises(CalibrationFileError, match=f"not YAML: line [0-9]+: .*{sentence}"):
+        load_calibration(path)
+
+
+def test_aliases_of_aliases_end_soon(tmp_path: Path) -> None:
+    path = tmp_path / "scale.yaml"
+    levels = [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]" for i in range(1, 30)]
+    path.write_text("l0: &l0 [1]\n" + "\n".join(levels) + "\nkind: *l29\n", encoding="utf-8")
+    with pytest.raises(CalibrationFileError, match="repeats a value by an alias") as caught:
+        load_calibration(path)
+    assert len(str(caught.value)) < 500
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    with pytest.raises(CalibrationFileError, match=r"pipe\.yaml: cannot be read: not a regular file"):
+        load_calibration(tmp_path / "pipe.yaml")
 
 
 def test_truncated_anywhere_is_refused_or_whole(tmp_path: Path) -> None:

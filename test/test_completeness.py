@@ -194,3 +194,20 @@ def test_no_pose_of_a_symmetric_frame_is_missed_beside_its_twin() -> None:
     sets = [random_spot_set(rng, frame, settings) for _ in range(549)]
     for number in (108, 169, 270, 479, 548):
         assert is_missed(frame, settings, sets[number].spots_px, sets[number].slice_from_frame) is False, number
+
+
+def test_second_pose_in_the_valley_of_a_lucky_one_is_a_rival() -> None:
+    """The true pose has a chi-square of 4, another one 33 degrees away happens to have 0.05: neither can be ruled out.
+
+    No triple of rods finds the true one, for three of its spots have no pose near it.
+    """
+    rng = np.random.default_rng(104)
+    starts, ends = rng.uniform(-30, 30, (2, 4, 3))
+    starts[:, 2], ends[:, 2] = -30, 30
+    frame = Frame("four", tuple("abcd"), starts, ends, np.ones(4))
+    spots_px = np.array([[241.259, 286.049], [233.406, 213.313], [262.06, 260.675], [238.029, 232.193]])
+    options = RegistrationOptions(max_log10_false_alarms=-4.0)
+    result = register_spots(spots_px, frame, PixelScale(0.5, 0.5), options, slice_area_mm2=AREA_MM2)
+    assert not result
+    assert result.reason == "ambiguous"
+    assert [round(one.chi_square, 1) for one in result.estimates] == [0.1, 4.1]

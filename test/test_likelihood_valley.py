@@ -65,7 +65,7 @@ def test_of_four_rods_it_is_the_mean_squared_error():
                 continue
             noisy = spots_px + 0.3 * rng.standard_normal(spots_px.shape)
             found, information, whitening = solved(frame, true, noisy, 0.3)
-            at_solution = np.linalg.inv(information)
+            at_solution = np.asarray(np.linalg.inv(information), dtype=np.float64)
             if not 0.75 < np.degrees(np.sqrt(np.linalg.eigvalsh(at_solution[3:, 3:])[-1])) < 10:
                 continue
             covariance = covariance_along_valley(frame, found, np.arange(4), SCALE.to_mm(noisy), whitening)

@@ -126,6 +126,7 @@ def test_faulty_value_is_named(name, value, sentence):
         ({"tls_certificate": "host.pem"}, "one of tls_certificate and tls_key is empty, expected both or neither"),
         ({"tls_client_ca": "ca.pem"}, "tls_client_ca is set without tls_certificate, expected both"),
         ({"watch_folder": "/nowhere"}, "watch_folder is '/nowhere', expected a folder"),
+        ({"watch_folder": "a" * 5000}, "watch_folder is 'a{199}, expected a folder"),
         ({"watch_folder": "/", "keep_folder": "/kept"}, "keep_folder /kept lies in watch_folder /"),
         ({"watch_folder": "/", "keep_folder": "/"}, "every slice would come twice"),
     ],

@@ -179,6 +179,11 @@ class TestPose:
         with pytest.raises(ValueError, match=told):
             Pose(rotation, translation)
 
+    @pytest.mark.parametrize("length", [1e-8, 1e-3, 1e200, 1e308])
+    def test_length_of_a_quaternion_does_not_matter(self, length: float) -> None:
+        found = rotation_from_quaternion([0.0, 0.6 * length, 0.0, 0.8 * length])
+        np.testing.assert_allclose(found, rotation_from_quaternion([0.0, 0.6, 0.0, 0.8]), atol=1e-15)
+
     @pytest.mark.parametrize(
         ("quaternion", "told"),
         [

@@ -19,7 +19,7 @@ from contract import DIAGNOSTIC_KEYS
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterEvent, ParameterValue
+from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -598,6 +598,16 @@ def test_malformed_parameter_request_leaves_the_node_alive(bench):
     hu, slice_from_frame = rendered(18)
     assert_near(bench.accept(image_of(hu))[0], slice_from_frame)
     bench.client.node.destroy_client(requests)
+
+
+def test_a_parameter_cannot_be_taken_away(bench):
+    for name in ("frame_files", "threshold"):
+        taken_away = [ParameterMessage(name=name, value=ParameterValue(type=ParameterType.PARAMETER_NOT_SET))]
+        request = SetParametersAtomically.Request(parameters=taken_away)
+        result = bench.client.call(SetParametersAtomically, f"{bench.node}/set_parameters_atomically", request).result
+        assert not result.successful
+        assert result.reason == f"{name} is not set, expected a value"
+    assert bench.set(threshold=2000.0) == ""
 
 
 def test_internal_error_is_refused_and_reported(monkeypatch, capfd):

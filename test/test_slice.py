@@ -85,6 +85,8 @@ class TestSlice:
             (np.array([[0, np.inf], [np.nan, 0]]), "image holds 2 pixels that are not finite"),
             (np.array([[np.inf, -np.inf], [np.nan, 0]]), "image holds 3 pixels that are not finite"),
             (np.array([[1e300, 0], [0, 0]]), "image holds 1 pixels that are not finite"),
+            (np.array([[2e9, 0], [0, -1]]), r"image holds values from -1 to 2e\+09, expected at most 1e\+09 HU"),
+            (np.array([[2, 0], [0, -3e38]]), r"image holds values from -3e\+38 to 2, expected at most 1e\+09 HU"),
         ],
     )
     def test_what_is_no_slice(self, image: Array, told: str) -> None:

@@ -136,3 +136,26 @@ class TestWhatIsASpot:
         image[20:23, 20:23] = 5000
         image[20:23, 25:28] = 9000
         np.testing.assert_allclose(spots_of(image), [[21, 21], [26, 21]], atol=0.05)
+
+
+class TestHostileImages:
+    @pytest.mark.parametrize("value", [3.4e8, -3.4e8, 1e9, 65535.0, 1e-30])
+    @pytest.mark.parametrize("threshold", [2000.0, 0.0, -500.0, "auto"])
+    def test_pixels_without_sense_are_spots_or_none(self, value: float, threshold: float | str) -> None:
+        options = RegistrationOptions(threshold=threshold)
+        # The first five have a spot of which nothing is known in one direction, to the last bit.
+        for seed in (58, 184, 194, 208, 19, *range(20)):
+            rng = np.random.default_rng(seed)
+            image = np.full((24, 24), -1000.0)
+            image[rng.integers(0, 24, 30), rng.integers(0, 24, 30)] = value
+            found = find_spots(Slice(image.astype(np.float32), PixelScale(1.0, 1.0)), options)
+            assert np.isfinite(found.centres_px).all()
+            assert np.isfinite(found.covariances_px2).all()
+
+    def test_slopes_in_one_direction_only(self) -> None:
+        """The information about such a spot's centre has no inverse, to the last bit where it is large."""
+        v, u = np.indices((24, 24))
+        for scale in (1.0, 1e3, 1e5):
+            image = np.where(np.abs(u - v) < 2, scale * 3000.0, 0.0)
+            image[:3] = image[-3:] = 0
+            spots_of(image, RegistrationOptions(threshold=1000.0, max_spot_area_mm2=1000.0))

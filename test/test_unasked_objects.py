@@ -16,8 +16,9 @@ from dicom_files import write_enhanced_ct, write_slice
 from pydicom import uid
 from pydicom.encaps import encapsulate
 
+from stereoreg_ros import dicom
 from stereoreg_ros.codestream import CodestreamSize, size_of
-from stereoreg_ros.dicom import DicomError, read_frames
+from stereoreg_ros.dicom import DicomError, read_frames, read_slice
 from stereoreg_ros.multiframe import single_frame
 
 MAX_BYTES = 2**20
@@ -80,6 +81,60 @@ def test_a_deflated_object_is_inflated_within_bounds():
         read_frames(Path("bomb"), start + bomb[:100], 2**30)
     with pytest.raises(DicomError, match="its deflated data cannot be inflated"):
         read_frames(Path("bomb"), start + b"\xff" * 100, 2**30)
+
+
+def test_an_rle_image_is_unpacked_within_bounds(tmp_path):
+    path = write_slice(tmp_path / "a.dcm", np.zeros((64, 64), np.uint16))
+    dataset = pydicom.dcmread(convert(path, Syntax(uid.RLELossless)))
+    # Runs of 128 bytes, each in two: 32 times what two bytes a pixel take.
+    runs = b"\x81\0" * (64 * 64)
+    header = struct.pack("<16I", 2, 64, 64 + len(runs), *[0] * 13)
+    dataset.PixelData = encapsulate([header + 2 * runs])
+    dataset["PixelData"].is_undefined_length = True
+    dataset.save_as(path)
+    with pytest.raises(DicomError, match="an RLE segment unpacks to more than twice the 4096 bytes of 4096 pixels"):
+        read_frames(Path("bomb"), path.read_bytes(), MAX_BYTES)
+    with pytest.raises(DicomError, match="an RLE segment unpacks to more than twice"):
+        read_slice(path)
+
+
+def test_of_a_jpeg_2000_file_the_image_in_its_box_counts(tmp_path):
+    path = convert(write_slice(tmp_path / "a.dcm", np.zeros((40, 48), np.uint16)), Syntax(uid.JPEG2000Lossless))
+    dataset = pydicom.dcmread(path)
+    small = single_frame(dataset)
+    place = small.index(b"\xff\x51") + 6
+    large = small[:place] + struct.pack(">2I", 60_000, 60_000) + small[place + 8 :]
+    # A reader that looks for the first size anywhere would find that of the box in front.
+    boxes = b"\0\0\0\x0cjP  \r\n\x87\n" + struct.pack(">I4s", 8 + len(small), b"free") + small
+    for inner, outcome in (
+        (large, "holds an image of 60000 rows, 60000 columns"),
+        (None, "a JPEG 2000 file holds no image"),
+    ):
+        file = boxes + (struct.pack(">I4s", 8 + len(inner), b"jp2c") + inner if inner else b"")
+        dataset.PixelData = encapsulate([file])
+        dataset["PixelData"].is_undefined_length = True
+        dataset.save_as(path)
+        with pytest.raises(DicomError, match=outcome):
+            read_frames(Path("hidden"), path.read_bytes(), MAX_BYTES)
+
+
+def test_files_are_bounded_as_well(tmp_path, monkeypatch):
+    monkeypatch.setattr(dicom, "_MAX_INFLATED_BYTES", 2**16)
+    small, large = (write_slice(tmp_path / f"{side}.dcm", np.zeros((side, side), np.uint16)) for side in (64, 256))
+    for path in (small, large):
+        dataset = pydicom.dcmread(path)
+        dataset.file_meta.TransferSyntaxUID = uid.DeflatedExplicitVRLittleEndian
+        dataset.save_as(path)
+    assert read_slice(small).header.rows == 64
+    with pytest.raises(DicomError, match="its deflated data inflate to more than 65536 bytes, expected fewer"):
+        read_slice(large)
+
+
+def test_what_a_refusal_repeats_is_bounded(tmp_path):
+    path = write_slice(tmp_path / "a.dcm", STORED, PixelSpacing=["0.5"] * 5000)
+    with pytest.raises(DicomError, match=r"Pixel Spacing .* expected 2 finite numbers") as caught:
+        read_slice(path)
+    assert len(str(caught.value)) < 1000
 
 
 def test_pixels_that_would_take_too_much_are_not_decoded(tmp_path):

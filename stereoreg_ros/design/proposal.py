@@ -16,13 +16,14 @@ from stereoreg_ros.geometry.pose import rotation_from_quaternion
 from stereoreg_ros.options import RegistrationOptions
 
 _ATTEMPTS = 3
-_POSES = 200
+_POSES = 500
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A frame; target_error_95_mm: over the wished poses; ambiguous, tried: of so many spot sets, how many another pose
-    explained as well, with all rods and with each one missing (tried is 0 where that was interrupted); interrupted.
+    """A frame; target_error_95_mm: over the wished poses; ambiguous, tried: of so many spot sets, with all rods and
+    with each one missing, how many another pose explained as well: at the first one, trying ends (tried is 0 where it
+    was interrupted); interrupted.
     """
 
     frame: Frame
@@ -40,7 +41,8 @@ def propose(
     chains: int,
     progress: Callable[[str, float, float], bool] | None = None,
 ) -> Proposal:
-    """The best layout of a search that is never ambiguous; where none is, of another search, and at last the best one.
+    """The best layout of a search that is never ambiguous; where none is, of another search, and at last the one that
+    was ambiguous latest.
 
     options: what the registration will be told, such as how the frame stands. progress: told what is done, the share of
     it done and the least error so far, says whether to go on.
@@ -63,7 +65,8 @@ def propose(
                 proposal = Proposal(frame, error, 0, 0, True)
             if proposal.interrupted or proposal.ambiguous == 0:
                 return proposal
-            best = best or proposal
+            if best is None or proposal.tried > best.tried:
+                best = proposal
     assert best is not None
     return best
 
@@ -92,6 +95,8 @@ def _tried(
     for trial in trials(frame, poses, wish.imaging.scale, options, left_out, np.random.default_rng(seed)):
         tried += 1
         ambiguous += trial.reason == "ambiguous" or (not trial.reason and not trial.right)
+        if ambiguous:
+            break
         if progress is not None and not progress("trying poses", tried / total, error):
             return Proposal(frame, error, ambiguous, tried, True)
     return Proposal(frame, error, ambiguous, tried, False)

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from stereoreg_ros.bounded_yaml import MOST_BYTES, UnusableYamlError, compose, shown
 from stereoreg_ros.geometry.frame import MIN_LINES, Frame
+from stereoreg_ros.whole_file import read_whole
 
-_MAX_BYTES = 1_000_000
 _MAX_LINES = 60
+_MAX_NAME = 100
 
 
 class FrameFileError(ValueError):
@@ -26,33 +28,21 @@ def load_frame(source: str | os.PathLike[str]) -> Frame:
     Raises FrameFileError where the file is missing or wrong in any way.
     """
     path = Path(source)
-    if path.suffix == "" and path.name == os.fspath(source) and not path.is_file():
+    if path.suffix == "" and path.name == os.fspath(source) and not os.path.isfile(path):
         shipped = shipped_frames()
         if path.name not in shipped:
             raise FrameFileError(
-                f"frame '{source}' is neither a file nor a shipped frame; shipped are: {', '.join(sorted(shipped))}"
+                f"frame '{os.fspath(source):.200}' is neither a file nor a shipped frame; "
+                f"shipped are: {', '.join(sorted(shipped))}"
             )
         path = shipped[path.name]
     try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
+        root = compose(read_whole(path, MOST_BYTES))
     except OSError as error:
-        raise FrameFileError(f"{path}: cannot be read: {error.strerror}") from None
-    if len(content) > _MAX_BYTES:
-        raise FrameFileError(f"{path}: is longer than {_MAX_BYTES} bytes, expected a frame file")
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError:
-        raise FrameFileError(f"{path}: is not UTF-8 text, expected YAML") from None
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.reader.ReaderError as error:
-        line = text.count("\n", 0, error.position) + 1
-        raise FrameFileError(f"{path}, line {line}: is not valid YAML: {error.reason}") from None
-    except (yaml.YAMLError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise FrameFileError(f"{path}{where}: is not valid YAML: {getattr(error, 'problem', error)}") from None
+        raise FrameFileError(f"{path!s:.1000}: cannot be read: {error.strerror}, expected a frame file") from None
+    except UnusableYamlError as error:
+        where = f", line {error.line}" if error.line else ""
+        raise FrameFileError(f"{path}{where}: {error.problem}") from None
     return _Reader(path).frame(root)
 
 
@@ -130,7 +120,7 @@ class _Reader:
         for key_node, value in node.value:
             name = key_node.value if isinstance(key_node, yaml.ScalarNode) else _kind(key_node)
             if name not in required:
-                raise self.fault(key_node, key, f"unknown key '{name}'", expected)
+                raise self.fault(key_node, key, f"unknown key '{shown(name)}'", expected)
             if name in entries:
                 raise self.fault(key_node, key, f"key '{name}' a second time", expected)
             entries[name] = value
@@ -142,7 +132,11 @@ class _Reader:
     def text(self, node: yaml.Node, key: str) -> str:
         if not isinstance(node, yaml.ScalarNode) or not str(node.value).strip():
             raise self.fault(node, key, _kind(node), "a name")
-        return str(node.value)
+        name = str(node.value)
+        # It goes into messages, which take no half of a surrogate pair, into pictures and onto terminals.
+        if not name.isprintable() or len(name) > _MAX_NAME:
+            raise self.fault(node, key, _kind(node), f"a name of at most {_MAX_NAME} printable characters")
+        return name
 
     def number(self, node: yaml.Node, key: str) -> float:
         try:
@@ -166,5 +160,5 @@ def _kind(node: yaml.Node | None) -> str:
     if node is None:
         return "an empty file"
     if isinstance(node, yaml.ScalarNode):
-        return f"'{node.value}'" if node.value else "nothing"
+        return f"'{shown(node.value)}'" if node.value else "nothing"
     return "a list" if isinstance(node, yaml.SequenceNode) else "a mapping"

@@ -137,7 +137,9 @@ def rotation_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
     quaternion = np.asarray(quaternion_xyzw, dtype=np.float64)
     if quaternion.shape != (4,):
         raise ValueError(f"quaternion has shape {quaternion.shape}, expected (4,) in the order x, y, z, w")
-    if not np.isfinite(quaternion).all() or np.linalg.norm(quaternion) < 1e-9:
+    largest = np.abs(quaternion).max()
+    if not np.isfinite(largest) or largest < 1e-9:
         raise ValueError(f"quaternion {quaternion.tolist()} is not finite or has no length")
-    rotation: Array = Rotation.from_quat(quaternion).as_matrix()
+    # The squares of very large numbers would be no numbers.
+    rotation: Array = Rotation.from_quat(quaternion / largest).as_matrix()
     return rotation

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.pose import Array, Pose
+
+# No scanner's values are larger, whatever they stand for; the squares of larger ones would not fit float32.
+LARGEST_HU: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,8 @@ class Slice:
     hu: (rows, columns) float32 in HU; pixel (u, v) is hu[v, u] and integer at the pixel's centre.
     scale: mm/pixel. scanner_from_slice: the slice's plane in the scanner; by default the scanner is the slice,
     as in the paper.
-    Raises ValueError where the image is not two-dimensional, is empty, or holds anything that is not finite.
+    Raises ValueError where the image is not two-dimensional, is empty, or holds anything that is not finite or beyond
+    LARGEST_HU.
     """
 
     hu: NDArray[np.float32]
@@ -74,8 +80,10 @@ class Slice:
             raise ValueError(f"image is empty: {hu.shape[0]} rows, {hu.shape[1]} columns")
         with np.errstate(over="ignore", invalid="ignore"):
             hu = np.ascontiguousarray(hu, dtype=np.float32)
-            # A sum is not finite as soon as one pixel is not: one pass, no temporary image.
-            total = hu.sum(dtype=np.float64)
-        if not np.isfinite(total):
+            # Neither is finite as soon as one pixel is no number.
+            least, most = float(hu.min()), float(hu.max())
+        if not (math.isfinite(least) and math.isfinite(most)):
             raise ValueError(f"image holds {int((~np.isfinite(hu)).sum())} pixels that are not finite")
+        if max(-least, most) > LARGEST_HU:
+            raise ValueError(f"image holds values from {least:g} to {most:g}, expected at most {LARGEST_HU:g} HU")
         object.__setattr__(self, "hu", hu)

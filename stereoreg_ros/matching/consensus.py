@@ -118,8 +118,9 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
 
     apart: see `decades_apart`.
 
-    They must come near the best one in likelihood, and in how rare they are by chance: from a few spots of the frame's
-    own, chance soon makes a match of one or two rods less.
+    They must come near the best one in likelihood; of fewer rods, also in how rare they are by chance: from a few spots
+    of the frame's own, chance soon makes a match of one or two rods less. Of as many rods they are rivals however lucky
+    the residuals of the best one are.
     """
     if not found:
         return []
@@ -129,7 +130,8 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
         for one in found
         if score(found[0], gains) - score(one, gains) < apart * math.log(10)
     ]
-    return [one for one in rivals if one.log10_false_alarms <= rivals[0].log10_false_alarms + apart]
+    most = rivals[0].log10_false_alarms + apart
+    return [one for one in rivals if one.inliers >= rivals[0].inliers or one.log10_false_alarms <= most]
 
 
 def log10_false_alarms(hypothesis: Hypothesis, spots: Spots, frame: Frame, prior: Prior) -> float:

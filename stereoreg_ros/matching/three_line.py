@@ -30,10 +30,11 @@ from stereoreg_ros.matching.consensus import (
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.pose_volume import plane_sample, typical_slices
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.seed_search import SeedSearch, search_seeds
+from stereoreg_ros.matching.seed_search import SeedSearch, Starts, search_seeds
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.triple_order import further_triples, triple_order
+from stereoreg_ros.matching.valley_starts import starts_along_valley
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.three_lines import ThreeLineSolver
@@ -179,10 +180,12 @@ class _Search:
             starts = seeds.reaching(level, most_chi_square, known)
             self._spend(_WORK_OF_START * starts.spot_of_line.size / 6 * (1 + len(self._spots.mm) / _FEW_SPOTS))
             for first in range(0, len(starts.spot_of_line), _CHUNK):
-                part = starts.take(slice(first, first + _CHUNK))
-                for hypothesis in settle(self._spots, self._frame, part, self._options.min_inliers):
-                    if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
-                        yield hypothesis
+                yield from self._settled(starts.take(slice(first, first + _CHUNK)))
+
+    def _settled(self, starts: Starts) -> Iterator[Hypothesis]:
+        for hypothesis in settle(self._spots, self._frame, starts, self._options.min_inliers):
+            if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
+                yield hypothesis
 
     def second_look(self, level: int, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """Explanations of so many rods, or more, besides the known, from further triples of rods than `level` tried."""
@@ -201,11 +204,11 @@ class _Search:
         The true pose may be the one that was missed, and what was found its twin: no level below would tell, as it
         seeks what comes near the best with fewer rods.
         """
+        yield from self._settled(starts_along_valley(known[0]))
         rods = known[0].inliers
-        if not _may_have_twins(self._frame, rods, self._spots.sigma_mm):
-            return iter(())
-        search, here, rows = self._among_own(known)
-        return _renumbered(search.second_look(rods, here), rows)
+        if _may_have_twins(self._frame, rods, self._spots.sigma_mm):
+            search, here, rows = self._among_own(known)
+            yield from _renumbered(search.second_look(rods, here), rows)
 
     def _among_own(self, known: list[Hypothesis]) -> tuple[_Search, list[Hypothesis], NDArray[np.intp]]:
         """The search among the spots of the best explanation known; what is known, in terms of these; their rows."""

@@ -14,6 +14,7 @@ from stereoreg_ros.geometry.pose import Array
 
 _PLANES = 400
 # Below this share of the best triple's quality a triple determines no pose (coplanar or all parallel rods).
+_LEAST_SIDE_MM = 1e-6
 _USELESS = 1e-3
 _MOST_SUBSETS = 50_000
 _STEPS = 24
@@ -118,16 +119,17 @@ def _qualities(frame: Frame) -> dict[tuple[int, int, int], float]:
 
 
 def _quality(cuts: Array, inside: Array, directions: Array, triple: tuple[int, int, int]) -> float:
-    visible = inside[:, triple].all(axis=1)
+    pairs = ((0, 1), (0, 2), (1, 2))
+    points = cuts[:, triple]
+    sides = [np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in pairs]
+    # Rods that meet, or lie within each other, have one spot there.
+    visible = inside[:, triple].all(axis=1) & (np.min(sides, axis=0) > _LEAST_SIDE_MM)
     if not visible.any():
         return 0.0
-    points = cuts[visible][:, triple]
+    points, sides = points[visible], [length[visible] for length in sides]
     jacobian = np.zeros((len(points), 3, 3))
-    sides = []
-    for row, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
+    for row, ((a, b), length) in enumerate(zip(pairs, sides, strict=True)):
         difference = points[:, a] - points[:, b]
-        length = np.linalg.norm(difference, axis=1)
-        sides.append(length)
         jacobian[:, row, a] = difference @ directions[triple[a]] / length
         jacobian[:, row, b] = -difference @ directions[triple[b]] / length
     weakest = np.linalg.svd(jacobian, compute_uv=False)[:, 2]

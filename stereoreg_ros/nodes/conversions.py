@@ -32,7 +32,8 @@ def hu_from_image(image: Image, rescale_slope: float = 1.0, rescale_intercept: f
     """
     pixel_type = _PIXEL_TYPES.get(image.encoding)
     if pixel_type is None:
-        raise MessageError(f"image encoding is '{image.encoding}', expected one of {', '.join(_PIXEL_TYPES)}")
+        # It may be of any length.
+        raise MessageError(f"image encoding is '{image.encoding:.40}', expected one of {', '.join(_PIXEL_TYPES)}")
     for name, side in (("width", image.width), ("height", image.height)):
         if not 0 < side <= MAX_SIDE_PX:
             raise MessageError(f"image {name} is {side}, expected 1 to {MAX_SIDE_PX} pixels")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
@@ -153,7 +153,7 @@ class NodeSettings:
         names = () if self.frame_files is None else self.frame_files
         object.__setattr__(self, "frame_files", names)
         if not isinstance(names, tuple) or not all(isinstance(name, str) and name for name in names):
-            raise ValueError(f"frame_files is {names!r}, expected a list of names or paths")
+            raise ValueError(f"frame_files is {names!r:.200}, expected a list of names or paths")
         for name in ("frame_file", "fiducial_frame_id"):
             if not getattr(self, name):
                 raise ValueError(f"{name} is empty, expected a name")
@@ -194,11 +194,15 @@ def declare_settings(node: Node) -> NodeSettings:
         raise ParameterError(str(error)) from None
 
 
-def changed_settings(node: Node, changes: Iterable[Parameter]) -> NodeSettings:
+def changed_settings(node: Node, changes: Sequence[Parameter]) -> NodeSettings:
     """The node's settings as they would be with `changes`; ValueError where they would not be valid.
 
     Parameters that are not in the table, which rclpy declares itself, are passed over.
     """
     values = {entry.name: plain(node.get_parameter(entry.name)) for entry in ENTRIES}
+    for parameter in changes:
+        # rclpy would not let go of a static parameter, but of one of dynamic type, and nobody could read that again.
+        if parameter.name in values and parameter.type_ == Parameter.Type.NOT_SET:
+            raise ValueError(f"{parameter.name} is not set, expected a value")
     values |= {parameter.name: plain(parameter) for parameter in changes if parameter.name in values}
     return NodeSettings.from_parameters(values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,17 +53,17 @@ class ReceptionSettings:
     def __post_init__(self) -> None:
         _require_title("ae_title", self.ae_title)
         if not isinstance(self.allowed_callers, tuple):
-            raise ValueError(f"allowed_callers is {self.allowed_callers!r}, expected a list of AE titles")
+            raise ValueError(f"allowed_callers is {self.allowed_callers!r:.200}, expected a list of AE titles")
         for title in self.allowed_callers:
             _require_title("allowed_callers", title)
         if bool(self.tls_certificate) != bool(self.tls_key):
             raise ValueError("one of tls_certificate and tls_key is empty, expected both or neither")
         if self.tls_client_ca and not self.tls_certificate:
             raise ValueError("tls_client_ca is set without tls_certificate, expected both")
-        if self.watch_folder and not Path(self.watch_folder).is_dir():
-            raise ValueError(f"watch_folder is {self.watch_folder!r}, expected a folder")
+        if self.watch_folder and not os.path.isdir(self.watch_folder):
+            raise ValueError(f"watch_folder is {self.watch_folder!r:.200}, expected a folder")
         if self.keep_folder and self.watch_folder:
-            kept, watched = Path(self.keep_folder).resolve(), Path(self.watch_folder).resolve()
+            kept, watched = (Path(os.path.realpath(folder)) for folder in (self.keep_folder, self.watch_folder))
             if kept == watched or watched in kept.parents:
                 raise ValueError(f"keep_folder {kept} lies in watch_folder {watched}: every slice would come twice")
 
@@ -96,6 +97,8 @@ def _require_title(name: str, title: object) -> None:
     # PS3.5 6.2, value representation AE.
     usable = isinstance(title, str) and title.isascii() and title.isprintable() and "\\" not in title
     if not isinstance(title, str) or not usable or title != title.strip():
-        raise ValueError(f"{name}: found {title!r}, expected an AE title of printable ASCII without a backslash")
+        raise ValueError(f"{name}: found {title!r:.60}, expected an AE title of printable ASCII without a backslash")
     if not 0 < len(title) <= _MAX_TITLE_CHARACTERS:
-        raise ValueError(f"{name}: found {title!r}, expected an AE title of 1 to {_MAX_TITLE_CHARACTERS} characters")
+        raise ValueError(
+            f"{name}: found {title!r:.60}, expected an AE title of 1 to {_MAX_TITLE_CHARACTERS} characters"
+        )

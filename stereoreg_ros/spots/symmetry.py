@@ -27,6 +27,8 @@ _FARTHEST_PX: Final = 1.0
 # Squared differences between a spot and its mirror image no larger than this, of the noise's variance, are noise; and
 # no matter, where the differences are smaller than this share of the spot's height.
 _MOST_NOISE, _MOST_ODD = 2.0, 0.03
+# So many times what is usual among the spots of a slice.
+_MUCH_MORE: Final = 10.0
 # Variance of whole HU.
 _ROUNDING_HU2: Final = 1 / 12
 
@@ -54,11 +56,12 @@ def centres_of_symmetry(
     for _ in range(_STEPS):
         compared = _compared(patches, centres, window, shut)
         centres = centres + np.clip(compared.step, -0.5, 0.5)
-    inverse = _inverse(compared.information + np.eye(2) * 1e-12)
-    covariances = compared.variance[:, None, None] * (inverse @ compared.by_noise @ inverse)
+    inverse = _inverse(_regular(compared.information))
+    height = np.abs(patches).max(axis=(1, 2))
+    variance = _moderated(compared.variance, noise_hu2, height)
+    covariances = variance[:, None, None] * (inverse @ compared.by_noise @ inverse)
     # Where more than noise disturbs the symmetry, as the end of a rod within the slice or a bubble in a tube, there is
     # no centre of symmetry: the centroid is taken, and what the two differ by is an error.
-    height = np.abs(patches).max(axis=(1, 2))
     lame = (compared.variance > _MOST_NOISE * noise_hu2) & (compared.variance > (_MOST_ODD * height) ** 2)
     differs = np.where(lame[:, None], centres - rough, 0.0)
     covariances += differs[:, :, None] * differs[:, None, :]
@@ -66,6 +69,18 @@ def centres_of_symmetry(
     lost = ~(np.linalg.norm(centres - rough, axis=1) <= _FARTHEST_PX) | ~np.isfinite(covariances).all(axis=(1, 2))
     centres[lost], covariances[lost] = rough[lost], _FARTHEST_PX**2 * np.eye(2)
     return centres, 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
+
+
+def _moderated(variance: Array, noise_hu2: Array, height: Array) -> Array:
+    """Variances (n,) HU^2 of what spots differ by from their mirror images, taken together.
+
+    Each by itself comes from a few dozen pixels. What is more than the noise comes of the pixels' size and grows with
+    the spot's height; for spots alike it is the same but for where between the pixels their centres lie. A spot that
+    differs by much more than the others has its own reason to, and keeps its own variance.
+    """
+    noise = np.median(noise_hu2)
+    usual = noise + np.median(np.maximum(variance - noise, 0.0) / np.maximum(height, 1.0) ** 2) * height**2
+    return np.asarray(np.where(variance < _MUCH_MORE * usual, usual, variance), dtype=np.float64)
 
 
 def _share_left(patches: Array, shut: NDArray[np.bool_], clipped: NDArray[np.bool_]) -> Array:
@@ -121,7 +136,7 @@ def _compared(patches: Array, centres: Array, window: Array, shut: NDArray[np.bo
     information[:, 1, 1] = np.einsum("nij,nij->n", weighted_v, slope_v)
     information[:, 0, 1] = information[:, 1, 0] = np.einsum("nij,nij->n", weighted_u, slope_v)
     pull = np.stack([np.einsum("nij,nij->n", part, odd) for part in (weighted_u, weighted_v)], axis=-1)
-    step = -0.5 * np.linalg.solve(information + 1e-9 * np.eye(2), pull[..., None])[..., 0]
+    step = -0.5 * np.linalg.solve(_regular(information), pull[..., None])[..., 0]
     # Between pixels the noise of the mirror image is less than a pixel's. Each pair of pixels counts twice, and the
     # centre takes two pairs' worth.
     noise = 1.0 + (mirror_v**2).sum(axis=2)[:, :, None] * (mirror_u**2).sum(axis=2)[:, None, :]
@@ -154,6 +169,13 @@ def _spline_coefficients(side: int) -> Array:
     basis = 2 / 3 * np.eye(side) + 1 / 6 * (np.eye(side, k=1) + np.eye(side, k=-1))
     basis[0, 1] = basis[-1, -2] = 1 / 3  # mirrored at both ends
     return _inverse(basis)
+
+
+def _regular(information: Array) -> Array:
+    """Information (n, 2, 2) that can be inverted where a spot has slopes in one direction only, or none."""
+    least = 1e-12 * np.trace(information, axis1=1, axis2=2) + 1e-12
+    regular: Array = information + least[:, None, None] * np.eye(2)
+    return regular
 
 
 def _inverse(matrices: Array) -> Array:
