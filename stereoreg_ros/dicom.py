@@ -169,17 +169,19 @@ def read_series(path: str | os.PathLike[str], on_fault: Callable[[DicomError], N
     return DicomSeries(tuple(headers), tuple(skipped))
 
 
-def read_frames(name: Path, content: bytes, max_bytes: int) -> tuple[DicomSlice, ...]:
+def read_frames(name: Path, content: bytes, max_bytes: int, uid: str = "") -> tuple[DicomSlice, ...]:
     """The slices of a DICOM object in memory, in the form of a file: one, or every frame of an Enhanced CT image.
 
     Meant for what arrives unasked, and stricter than `read_slice`: every slice must say where it lies, CT must say how
     values become HU, and projections (localizers) are no slices. name: stands for the object in errors.
-    max_bytes: most that its data or its pixels may take when unpacked.
-    Raises DicomError.
+    max_bytes: most that its data or its pixels may take when unpacked. uid: the SOP Instance UID that it was announced
+    with; empty: none. Raises DicomError.
     """
     if content[128:_META_START] != b"DICM":
         raise DicomError(name, f"{_NO_LETTERS}, expected a DICOM file")
     dataset = _parse(name, BytesIO(_inflated(name, content, max_bytes)), stop_before_pixels=False)
+    if uid and str(_value(name, dataset, "SOPInstanceUID")) != uid:
+        raise _fault(name, "SOPInstanceUID", _value(name, dataset, "SOPInstanceUID"), f"{uid}, as announced")
     _require_decoded_size(name, dataset, max_bytes)
     _require_no_projection(name, dataset)
     frames = [dataset]

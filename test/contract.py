@@ -33,6 +33,7 @@ PUBLISHED = {
 SUBSCRIBED = {
     "image": "sensor_msgs/msg/Image",
     "slice_pose": "geometry_msgs/msg/PoseStamped",
+    "slice_spacing": "geometry_msgs/msg/Vector3Stamped",
     "target": "geometry_msgs/msg/PointStamped",
 }
 SERVICES = {

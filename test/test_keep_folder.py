@@ -19,7 +19,9 @@ from ros_process import RosClient
 from test_receive_dicom_node import CANNOT_UNDERSTAND, OUT_OF_RESOURCES, SUCCESS, port_of, receiver, receiving_process
 
 from stereoreg_ros.dicom import read_slice
+from stereoreg_ros.reception.intake import Intake, ObjectRefusedError
 from stereoreg_ros.reception.kept_objects import KeptObjects, is_uid
+from stereoreg_ros.reception.slice_queue import SliceQueue
 
 IMAGE = np.arange(512 * 512, dtype=np.uint16).reshape(512, 512)
 
@@ -61,6 +63,21 @@ def test_what_is_refused_is_not_kept(client, tmp_path, folder):
     with receiver(client, keep_folder=str(folder)) as received:
         assert send(received.port, bad)[0].Status == CANNOT_UNDERSTAND
     assert not list(folder.iterdir())
+
+
+def test_an_object_that_is_not_what_it_was_announced_as_is_refused_and_not_kept(tmp_path, folder):
+    content = write_slice(tmp_path / "a.dcm", IMAGE, SOPInstanceUID="1.2.3").read_bytes()
+    queue = SliceQueue(10)
+    intake = Intake(queue, 2**20)
+    with pytest.raises(
+        ObjectRefusedError, match=r"SOP Instance UID \(0008,0018\) is '1.2.3', expected 1.2.4"
+    ) as refused:
+        intake.take(Path("1.2.4"), content, "1.2.4", KeptObjects(folder))
+    assert refused.value.status == CANNOT_UNDERSTAND
+    assert not list(folder.iterdir())
+    assert len(queue) == 0
+    assert intake.take(Path("1.2.3"), content, "1.2.3", KeptObjects(folder)) == 1
+    assert [one.name for one in folder.iterdir()] == ["1.2.3.dcm"]
 
 
 def test_folder_that_is_gone_refuses_until_it_is_back(client, tmp_path, folder):

@@ -122,6 +122,30 @@ def test_subfolders_are_looked_into_and_links_are_not(folder, tmp_path, caplog):
     assert not caplog.records
 
 
+def test_a_folder_that_becomes_a_link_is_not_followed(folder, tmp_path, caplog):
+    """Between the look at a file and its being read."""
+    outside = tmp_path / "outside"
+    (folder / "series").mkdir()
+    path = write_slice(folder / "series" / "a.dcm", IMAGE + 4)
+    os.utime(path, ns=(1, 1))
+    watch = Watch(folder)
+    os.utime(path, ns=(2, 2))
+    watch.look()
+    walk = os.walk
+
+    def walk_and_exchange(*arguments, **named):
+        found = list(walk(*arguments, **named))
+        shutil.move(folder / "series", outside)
+        (folder / "series").symlink_to(outside)
+        return iter(found)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "walk", walk_and_exchange)
+        patch.setattr(Path, "lstat", lambda path: os.lstat(outside / path.name if outside.exists() else path))
+        assert watch.look() == []
+    assert "Not a directory" in caplog.text or "Too many levels of symbolic links" in caplog.text
+
+
 def test_a_share_that_goes_and_comes_back_brings_nothing_old(folder, tmp_path):
     watch = Watch(folder)
     write_slice(folder / "a.dcm", IMAGE + 1)

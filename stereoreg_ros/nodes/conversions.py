@@ -7,12 +7,13 @@ import sys
 from typing import Final
 
 import numpy as np
-from geometry_msgs.msg import Point, PointStamped, PoseStamped, Quaternion
+from geometry_msgs.msg import Point, PointStamped, PoseStamped, Quaternion, Vector3, Vector3Stamped
 from geometry_msgs.msg import Pose as PoseMessage
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from stereoreg_ros.geometry.pose import Array, Pose
+from stereoreg_ros.geometry.slice import PixelScale
 
 MM_PER_M: Final = 1000.0
 MAX_SIDE_PX: Final = 8192
@@ -111,6 +112,21 @@ def covariance_to_message(covariance: Array) -> list[float]:
     to_ros = np.array([1 / MM_PER_M] * 3 + [1.0] * 3)
     numbers: list[float] = (covariance * np.outer(to_ros, to_ros)).ravel().tolist()
     return numbers
+
+
+def scale_to_message(scale: PixelScale) -> Vector3:
+    """A pixel scale as x = sx, y = sy, z = shear in metres per pixel."""
+    x, y, z = (float(value) / MM_PER_M for value in (scale.sx, scale.sy, scale.shear))
+    return Vector3(x=x, y=y, z=z)
+
+
+def scale_from_message(message: Vector3Stamped) -> PixelScale:
+    """The pixel scale of a Vector3Stamped; MessageError where it is none."""
+    vector = message.vector
+    try:
+        return PixelScale(vector.x * MM_PER_M, vector.y * MM_PER_M, vector.z * MM_PER_M)
+    except ValueError as error:
+        raise MessageError(str(error)) from None
 
 
 def point_to_message(point_mm: Array) -> Point:

@@ -11,6 +11,8 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from stereoreg_ros.result import Reason, Refusal, Registration, diagnostics
 
 NAME: Final = "register_node: registration"
+# How the message begins that refuses an image with another pixel spacing than the one told.
+OTHER_SPACING: Final = "the slice's pixel spacing is"
 
 
 def status_of(

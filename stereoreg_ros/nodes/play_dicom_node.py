@@ -31,7 +31,7 @@ ENTRIES: Final = (
 
 
 class PlayDicomNode(Node):
-    """Publishes each slice as `slice_pose` (scanner_from_slice) and then `image` (in HU), with the same stamp.
+    """Publishes each slice as `slice_spacing`, `slice_pose` (scanner_from_slice) and `image` (in HU), with one stamp.
 
     A slice that cannot be read is reported and left out.
     finished: the last slice has reached all subscribers; faults: number of slices left out.
@@ -84,7 +84,8 @@ class PlayDicomNode(Node):
     def _play_next(self) -> None:
         path = self._series.headers[self._next].path
         try:
-            self._publisher.publish(read_slice(path), self.get_clock().now().to_msg())
+            stamp = self._publisher.unique_stamp(self.get_clock().now().nanoseconds)
+            self._publisher.publish(read_slice(path), stamp)
         except DicomError as error:
             self.faults += 1
             self.get_logger().error(f"left out: {error}")

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
 from builtin_interfaces.msg import Time as TimeMessage
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.time import Time
 
 import stereoreg_ros.reception
-from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.parameters import ParameterError
 from stereoreg_ros.nodes.reception_log import NodeLogHandler
 from stereoreg_ros.nodes.reception_parameters import ReceptionSettings, declare_reception
@@ -32,35 +29,16 @@ from stereoreg_ros.reception.watched_folder import WatchedFolder
 # A search that is given up takes ten seconds or so.
 ANSWER_S: Final = 15.0
 TRIES: Final = 3
-# By then register_node has done with every slice that it was sent, or is another process.
-SETTLED_S: Final = 60.0
 _POLL_S: Final = 0.01
 # Where nobody answers: subscribers keep the last few only, and need time to take them.
 _UNANSWERED_S: Final = 0.02
 _NS_PER_S: Final = 10**9
 
 
-@dataclass(frozen=True)
-class _Stray:
-    """A slice that was sent more often than it was answered: register_node may have it in its queue still.
-
-    until_s: when it has certainly done with it, seconds of the monotonic clock. answers: how many end that earlier.
-    """
-
-    scale: PixelScale
-    until_s: float
-    answers: int | None
-
-    def stands_in_the_way_of(self, scale: PixelScale, count: int) -> bool:
-        """Whether, told of this pixel spacing, register_node might register the stray slice with it."""
-        answered = self.answers is not None and count >= self.answers
-        return scale != self.scale and not answered and time.monotonic() < self.until_s
-
-
 class ReceiveDicomNode(Node):
-    """Publishes each slice as `slice_pose` (scanner_from_slice) and then `image` (in HU), in the order of arrival.
+    """Publishes each slice as `slice_spacing`, `slice_pose` and `image` (in HU), in the order of arrival.
 
-    Both bear the time of arrival. register_node gets a slice when it has answered the one before: none overflows its
+    They bear the time of arrival. register_node gets a slice when it has answered the one before: none overflows its
     queue, and none is registered with the pixel spacing of another.
     """
 
@@ -73,13 +51,12 @@ class ReceiveDicomNode(Node):
             SpacingTeller(self, settings.register_node, with_slice_poses=True) if settings.register_node else None
         )
         self._answers = RegistrationAnswers(self)
-        self._last_stamp_ns = 0
         self._sent: ReceivedSlice | None = None
         self._sent_stamp = TimeMessage()
         self._answer_by_s = 0.0
         self._tries = 0
         self._answers_before = 0
-        self._stray: _Stray | None = None
+        self._sent_to = 0
         self._waits_for = ""
         self._log_handler = NodeLogHandler(self)
         log = logging.getLogger(stereoreg_ros.reception.__name__)
@@ -154,8 +131,6 @@ class ReceiveDicomNode(Node):
             if not self._is_done(received):
                 return
             self._queue.remove_first()
-            if self._teller is not None and self._answers.count < self._tries:
-                self._stray = _Stray(received.dicom_slice.ct_slice.scale, time.monotonic() + SETTLED_S, self._tries)
             self._sent, self._tries = None, 0
             received = self._queue.first()
         if received is not None and self._may_publish(received):
@@ -164,8 +139,6 @@ class ReceiveDicomNode(Node):
     def _may_publish(self, received: ReceivedSlice) -> bool:
         """Whether somebody listens, and register_node knows this slice's pixel spacing."""
         scale = received.dicom_slice.ct_slice.scale
-        if self._stray is not None and self._stray.stands_in_the_way_of(scale, self._answers.count):
-            return False
         if self._teller is not None:
             if not self._teller.tell(scale):
                 return False
@@ -186,10 +159,9 @@ class ReceiveDicomNode(Node):
         if self._tries == 0:
             self._sent_stamp = self._stamp_of(received)
             self._answers.expect(self._sent_stamp)
-            if self._stray is not None:
-                # Its answers are not counted any more, but it may still be registered.
-                self._stray = replace(self._stray, answers=None)
         self._answers_before = self._answers.count
+        if self._teller is not None:
+            self._sent_to = self._teller.processes_seen()
         self._publisher.publish(received.dicom_slice, self._sent_stamp)
         self._sent = received
         self._tries += 1
@@ -203,27 +175,26 @@ class ReceiveDicomNode(Node):
         answered = self._answers.count > self._answers_before
         if answered and self._answers.came_with(sent.dicom_slice.ct_slice.scale):
             return True
-        if not answered and not overdue:
+        replaced = self._teller.processes_seen() != self._sent_to
+        if not answered and not overdue and not replaced:
             return False
-        # Another process may have taken register_node's place, unnoticed, and was not told the spacing.
         self._teller.forget()
-        fault = "with another pixel spacing" if answered else f"nothing within {ANSWER_S:g} s"
         name = self._settings.register_node
+        if answered:
+            fault = f"{name} answered a slice with another pixel spacing"
+        else:
+            fault = f"{name} was started anew" if replaced else f"{name} did not answer a slice within {ANSWER_S:g} s"
         if self._tries < TRIES:
-            self.get_logger().warning(
-                f"{name} answered a slice {fault}: it is told the spacing and sent the slice again"
-            )
+            self.get_logger().warning(f"{fault}: it is told the spacing and sent the slice again")
             self._sent = None
             return False
-        self.get_logger().error(f"{name} answered a slice {fault} for the {TRIES}rd time, going on with the next")
+        self.get_logger().error(f"{fault} for the {TRIES}rd time, going on with the next slice")
         return True
 
     def _stamp_of(self, received: ReceivedSlice) -> TimeMessage:
         """When the slice arrived, by the node's clock; no two slices have the same stamp."""
         age_ns = int((time.monotonic() - received.arrival_s) * _NS_PER_S)
-        arrival_ns = self.get_clock().now().nanoseconds - age_ns
-        self._last_stamp_ns = max(arrival_ns, self._last_stamp_ns + 1)
-        return Time(nanoseconds=self._last_stamp_ns).to_msg()
+        return self._publisher.unique_stamp(self.get_clock().now().nanoseconds - age_ns)
 
 
 def main() -> int:

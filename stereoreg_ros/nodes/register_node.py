@@ -7,11 +7,14 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped, Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -26,17 +29,18 @@ from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
-from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.nodes import conversions
 from stereoreg_ros.nodes.backlog import MOST_WAIT_S, Backlog, received_s, waiting_in
+from stereoreg_ros.nodes.by_stamp import WAIT_S, ByStamp
 from stereoreg_ros.nodes.conversions import MessageError
-from stereoreg_ros.nodes.diagnostic_status import status_of, status_of_unusable
+from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING, status_of, status_of_unusable
 from stereoreg_ros.nodes.frame_output import FrameOutput, FrameTopics
+from stereoreg_ros.nodes.image_sources import ImageSources
 from stereoreg_ros.nodes.markers import markers_of
 from stereoreg_ros.nodes.parameters import NodeSettings, ParameterError, changed_settings, declare_settings
 from stereoreg_ros.nodes.quality import QUEUE, publisher_of, subscription_of
 from stereoreg_ros.nodes.scale_keeper import ScaleKeeper
-from stereoreg_ros.nodes.slice_poses import WAIT_S, SlicePoses
 from stereoreg_ros.nodes.spinning import run
 from stereoreg_ros.nodes.stream_status import StreamStatus
 from stereoreg_ros.nodes.targets import TargetInFrame, status_of_target, target_in_frame
@@ -52,6 +56,14 @@ _PREPARE_S = 2.0
 _SPARE_TIME_S = 0.2
 _NOTHING = object()
 _TOPIC_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True, eq=False)
+class _Unregistered:
+    """An image and the pixel spacing that it came with; None where it came with none."""
+
+    image: Image
+    spacing: PixelScale | MessageError | None
 
 
 class RegisterNode(Node):
@@ -71,8 +83,9 @@ class RegisterNode(Node):
         self._spare_time = self.create_timer(_SPARE_TIME_S, self._prepare_in_spare_time, clock=steady)
         self._frame_fault = self._load_start_frames()
         self._backlog = Backlog()
-        self._slice_poses = SlicePoses()
-        self._slice_pose_seen = False
+        self._slice_spacings: ByStamp[PixelScale, Image] = ByStamp("slice_spacing", PixelScale.__eq__)
+        self._slice_poses: ByStamp[Pose, _Unregistered] = ByStamp("slice_pose", _same_pose)
+        self._slice_spacing_seen = self._slice_pose_seen = False
         self._target: PointStamped | None = None
         self._stream = StreamStatus(time.monotonic())
         self._send_transform: Callable[[TransformStamped], None] | None = None
@@ -81,9 +94,13 @@ class RegisterNode(Node):
         self._diagnostics = publisher_of(self, DiagnosticArray, "/diagnostics", QUEUE)
         self._overlay = publisher_of(self, Image, "overlay", QUEUE)
         self._markers = publisher_of(self, MarkerArray, "markers", QUEUE)
-        # The pose before the image: where both are there, rclpy serves them in this order and no image has to wait.
+        # The image last: where all are there, rclpy serves them in this order and no image has to wait.
+        self._slice_spacing_input = subscription_of(
+            self, Vector3Stamped, "slice_spacing", self._on_slice_spacing, QUEUE
+        )
         self._slice_pose_input = subscription_of(self, PoseStamped, "slice_pose", self._on_slice_pose, QUEUE)
         self._image_input = subscription_of(self, Image, "image", self._on_image, QUEUE)
+        self._sources = ImageSources(self, (self._image_input, self._slice_pose_input, self._slice_spacing_input))
         subscription_of(self, PointStamped, "target", self._on_target, QUEUE)
         self._more_wait = self.create_guard_condition(self._register_next)
         self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=steady)
@@ -122,15 +139,39 @@ class RegisterNode(Node):
             self._more_wait.trigger()
 
     def _pair(self, image: Image) -> None:
-        """Register an image with its slice pose, or let it wait for that."""
-        if not self._slice_pose_expected():
-            self._register(image, Pose.identity())
-            return
-        scanner_from_slice = self._slice_poses.take_pose(image.header.stamp)
-        if scanner_from_slice is None:
-            self._slice_poses.add_image(image, time.monotonic())
+        """Register an image with its slice_spacing and slice_pose, or let it wait for them."""
+        stamp = image.header.stamp
+        if not self._slice_spacing_expected():
+            self._pair_with_pose(_Unregistered(image, None))
+        elif stamp == TimeMessage():
+            self._register(_Unregistered(image, _NO_STAMP), _NO_STAMP)
+        elif (spacing := self._slice_spacings.take(stamp)) is not None:
+            self._pair_with_pose(_Unregistered(image, spacing))
         else:
-            self._register(image, scanner_from_slice)
+            self._slice_spacings.wait(stamp, image, time.monotonic())
+
+    def _pair_with_pose(self, unregistered: _Unregistered) -> None:
+        stamp = unregistered.image.header.stamp
+        if not self._slice_pose_expected():
+            self._register(unregistered, Pose.identity())
+        elif stamp == TimeMessage():
+            self._register(unregistered, _NO_STAMP)
+        elif (scanner_from_slice := self._slice_poses.take(stamp)) is not None:
+            self._register(unregistered, scanner_from_slice)
+        else:
+            self._slice_poses.wait(stamp, unregistered, time.monotonic())
+
+    def _on_slice_spacing(self, message: Vector3Stamped) -> None:
+        self._slice_spacing_seen = True
+        spacing: PixelScale | MessageError
+        try:
+            spacing = conversions.scale_from_message(message)
+        except MessageError as error:
+            spacing = MessageError(f"slice_spacing: {error}")
+            self.get_logger().warning(str(spacing))
+        met = self._slice_spacings.add(message.header.stamp, spacing)
+        if met is not None:
+            self._pair_with_pose(_Unregistered(*met))
 
     def _on_slice_pose(self, message: PoseStamped) -> None:
         self._slice_pose_seen = True
@@ -140,13 +181,24 @@ class RegisterNode(Node):
         except MessageError as error:
             scanner_from_slice = MessageError(f"slice_pose: {error}")
             self.get_logger().warning(str(scanner_from_slice))
-        image = self._slice_poses.add_pose(message.header.stamp, scanner_from_slice)
-        if image is not None:
-            self._register(image, scanner_from_slice)
+        met = self._slice_poses.add(message.header.stamp, scanner_from_slice)
+        if met is not None:
+            self._register(*met)
 
     def _refuse_overdue(self) -> None:
-        while (image := self._slice_poses.take_overdue(time.monotonic())) is not None:
-            self._register(image, MessageError(f"no slice_pose with the image's stamp came within {WAIT_S:g} s"))
+        now_s = time.monotonic()
+        while (image := self._slice_spacings.take_overdue(now_s)) is not None:
+            fault = MessageError(f"no slice_spacing with the image's stamp came within {WAIT_S:g} s")
+            self._register(_Unregistered(image, fault), fault)
+        while (unregistered := self._slice_poses.take_overdue(now_s)) is not None:
+            fault = MessageError(f"no slice_pose with the image's stamp came within {WAIT_S:g} s")
+            self._register(unregistered, fault)
+
+    # Who publishes slices has announced their spacings and poses before their images, and DDS keeps that order: by the
+    # time of the first image it is known what comes with it.
+
+    def _slice_spacing_expected(self) -> bool:
+        return self._slice_spacing_seen or self.count_publishers(self._slice_spacing_input.topic_name) > 0
 
     def _slice_pose_expected(self) -> bool:
         return (
@@ -155,15 +207,16 @@ class RegisterNode(Node):
             or self.count_publishers(self._slice_pose_input.topic_name) > 0
         )
 
-    def _register(self, image: Image, scanner_from_slice: Pose | MessageError) -> None:
+    def _register(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError) -> None:
         """Register one image and publish what came of it; whatever is in the image, the node lives on."""
         started, came_s = time.perf_counter(), time.monotonic()
+        image = unregistered.image
         header = Header(stamp=image.header.stamp, frame_id=self.settings.scanner_frame_id or image.header.frame_id)
         if not self._outputs:
             self._refuse_unusable("bad_frame", self._frame_fault, header, started)
             return
         try:
-            ct_slice = self._slice_from(image, scanner_from_slice)
+            ct_slice = self._slice_from(unregistered, scanner_from_slice)
             results = register_frames(
                 ct_slice,
                 [output.frame for output in self._outputs],
@@ -192,16 +245,26 @@ class RegisterNode(Node):
 
     def _skip(self, image: Image) -> None:
         """Answer an image that is not registered, since newer ones wait; the latest pose stays as it is."""
+        # Left behind, these might be taken for those of a later image with its stamp.
+        self._slice_spacings.take(image.header.stamp)
+        self._slice_poses.take(image.header.stamp)
         message = f"skipped for a newer slice: it had waited for over {MOST_WAIT_S:g} s"
         statuses = self._unusable("skipped", message, image.header.frame_id, 0.0)
         self._publish_statuses(statuses, image.header)
 
-    def _slice_from(self, image: Image, scanner_from_slice: Pose | MessageError) -> Slice:
+    def _slice_from(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError) -> Slice:
+        image, spacing = unregistered.image, unregistered.spacing
+        if isinstance(spacing, MessageError):
+            raise spacing
         if isinstance(scanner_from_slice, MessageError):
             raise scanner_from_slice
+        if fault := self._sources.fault(time.monotonic()):
+            raise MessageError(fault)
         settings = self.settings
         if settings.scale is None:
             raise MessageError("pixel_spacing is not told yet, set the parameter to [sx, sy] in mm/pixel")
+        if spacing is not None and not self._scale.stands_for(spacing):
+            raise MessageError(f"{OTHER_SPACING} {spacing}, expected that which was told, {self._scale.configured}")
         hu = conversions.hu_from_image(image, settings.rescale_slope, settings.rescale_intercept)
         return Slice(hu, settings.scale, scanner_from_slice)
 
@@ -268,6 +331,8 @@ class RegisterNode(Node):
 
     def _report_stream(self) -> None:
         now_s = time.monotonic()
+        if fault := self._sources.fault(now_s):
+            self.get_logger().warning(fault, throttle_duration_sec=_REPEAT_WARNING_S)
         if not self._stream.due(now_s, self.settings.stale_after):
             return
         status = self._stream.report(
@@ -403,6 +468,13 @@ class RegisterNode(Node):
 # What the matcher's tables depend on.
 _OF_THE_TABLES = {"pixel_spacing", "spot_noise_px", "matcher", "nominal_orientation", "max_rotation_deg", "min_inliers"}
 _NO_TF2 = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
+
+
+_NO_STAMP = MessageError("its stamp is 0, expected one by which to know its slice_spacing and slice_pose")
+
+
+def _same_pose(one: Pose, other: Pose) -> bool:
+    return np.array_equal(one.rotation, other.rotation) and np.array_equal(one.translation, other.translation)
 
 
 def _loaded(sources: tuple[str, ...]) -> tuple[Frame, ...]:

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.diagnostic_status import NAME
+from stereoreg_ros.nodes.diagnostic_status import NAME, OTHER_SPACING
 
 _QUEUE = 10
 _SAME_SPACING = 1e-4
@@ -24,7 +24,7 @@ class RegistrationAnswers:
         self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _QUEUE)
         self._stamp: Time | None = None
         self.count = 0
-        self._measured = False
+        self._measured = self._refused_for_spacing = False
         self._spacing = (0.0, 0.0)
 
     @property
@@ -38,6 +38,8 @@ class RegistrationAnswers:
 
     def came_with(self, scale: PixelScale) -> bool:
         """Whether the last answer rests on this pixel spacing, or on one that was measured in its place."""
+        if self._refused_for_spacing:
+            return False
         return self._measured or np.allclose(self._spacing, (scale.sx, scale.sy), rtol=_SAME_SPACING, atol=0.0)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -48,6 +50,7 @@ class RegistrationAnswers:
             if status.name.startswith(NAME):
                 self.count += 1
                 values = {one.key: one.value for one in status.values}
+                self._refused_for_spacing = status.message.startswith(OTHER_SPACING)
                 self._measured = values["calibration"] == "measured"
                 self._spacing = (float(values["pixel_spacing_x_mm"]), float(values["pixel_spacing_y_mm"]))
                 return

@@ -29,6 +29,7 @@ from stereoreg_ros.nodes.parameters import NodeSettings
 from stereoreg_ros.nodes.recalibration import NextTurn, Recalibration
 
 _POLL_S = 0.002
+_SAME_SPACING = 1e-4
 
 
 class _Registering(Protocol):
@@ -59,20 +60,33 @@ class ScaleKeeper:
         node.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=ReentrantCallbackGroup())
         node.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
 
+    @property
+    def configured(self) -> PixelScale | None:
+        """What was told or configured last; None where nothing was. In its place a measured scale may be in use."""
+        return self._configured
+
+    def stands_for(self, spacing: PixelScale) -> bool:
+        """Whether the scale in use is the right one for a slice that came with this spacing."""
+        if self._configured is None:
+            return False
+        ours, slices = ((one.sx, one.sy, one.shear) for one in (self._configured, spacing))
+        return np.allclose(ours, slices, rtol=_SAME_SPACING, atol=_SAME_SPACING * spacing.sx)
+
     def told(self, before: PixelScale | None) -> bool:
-        """The scale's parameters were set; returns whether somebody else did, and to something new."""
+        """The scale's parameters were set; returns whether somebody else did, and the scale in use is another now."""
         if self._sets_it_itself:
             return False
-        scale = self._registering.settings.scale
-        self._configured, self.source, self.covariance = scale, "configured", None
-        return scale != before
+        self._configured, self.source, self.covariance = self._registering.settings.scale, "configured", None
+        # Whoever sends slices tells their spacing, and tells it again after every restart.
+        self.load()
+        return self._registering.settings.scale != before
 
     def keep_slices(self, count: int) -> None:
         """Keep the last `count` slices to measure from."""
         self.sightings = deque(self.sightings, maxlen=count)
 
     def load(self) -> None:
-        """Take up what was measured before the restart, where that can be trusted."""
+        """Take up what was measured in place of the configured scale, where that can be trusted."""
         settings, log = self._registering.settings, self._node.get_logger()
         if not settings.calibration_file:
             return

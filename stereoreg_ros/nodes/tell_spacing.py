@@ -42,6 +42,12 @@ class SpacingTeller:
             self._client = node.create_client(SetParametersAtomically, f"{target}/set_parameters_atomically")
         except NameValidationException as error:
             raise ParameterError(f"'{target}' is no name of a node: {error}") from None
+        self._node = node
+        # Every node publishes its parameter events, each process of it with a publisher of its own.
+        service = node.resolve_service_name(self._client.srv_name)
+        self._full_name = service.removesuffix("/set_parameters_atomically")
+        self._processes: set[bytes] = set()
+        self._seen = 0
         self._accepted: PixelScale | None = None
         self._request: _Request | None = None
         self._retry_at_s = 0.0
@@ -50,9 +56,10 @@ class SpacingTeller:
     def tell(self, scale: PixelScale) -> bool:
         """Take the next step, if one is due; true once the target has accepted exactly this scale.
 
-        To be called again and again, from a timer. When the target goes away, what it accepted is forgotten, and it
-        is told again when it returns.
+        To be called again and again, from a timer. When the target goes away, or another process comes up in its place,
+        what was accepted is forgotten, and it is told again.
         """
+        self.processes_seen()
         if not self._client.service_is_ready():
             self.forget()
             self._say(f"waiting for the parameter service of {self._target}")
@@ -71,6 +78,22 @@ class SpacingTeller:
         if self._request is not None:
             self._client.remove_pending_request(self._request.answer)
             self._request = None
+
+    def processes_seen(self) -> int:
+        """How many processes have been seen under the target's name so far; a new one is told anew.
+
+        DDS counts a killed process on for a while, and its service as ready: this tells it from the one in its place.
+        """
+        processes = {
+            bytes(one.endpoint_gid)
+            for one in self._node.get_publishers_info_by_topic("/parameter_events")
+            if f"{one.node_namespace.rstrip('/')}/{one.node_name}" == self._full_name
+        }
+        if processes - self._processes:
+            self._seen += len(processes - self._processes)
+            self.forget()
+        self._processes = processes
+        return self._seen
 
     def _send(self, scale: PixelScale) -> None:
         parameters = [

@@ -40,7 +40,8 @@ class Intake:
     def take(self, name: Path, content: bytes, uid: str = "", kept: KeptObjects | None = None) -> int:
         """Take an object in the form of a DICOM file; returns the number of its slices.
 
-        name: stands for it in reasons. kept: where it is kept, under `uid`, before this returns.
+        name: stands for it in reasons. uid: what it was announced as, and must bear. kept: where it is kept, under that
+        UID, before this returns.
         Raises ObjectRefusedError; nothing of the object is queued then.
         """
         arrival_s = time.monotonic()
@@ -49,7 +50,7 @@ class Intake:
                 OUT_OF_RESOURCES, f"{name}: has {len(content)} bytes, expected {self._max_object_bytes} at most"
             )
         try:
-            frames = read_frames(name, content, self._max_object_bytes)
+            frames = read_frames(name, content, self._max_object_bytes, uid)
         except DicomError as error:
             raise ObjectRefusedError(CANNOT_UNDERSTAND, str(error)) from None
         low, high = _SPACING_RANGE_MM

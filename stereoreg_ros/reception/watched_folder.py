@@ -15,8 +15,9 @@ from stereoreg_ros.reception.intake import OUT_OF_RESOURCES, Intake, ObjectRefus
 
 _LOG = logging.getLogger(__name__)
 _Version: TypeAlias = tuple[int, int]
-# Neither links nor what is no file is opened, not even where it was put in a file's place a moment ago.
+# Neither links nor what is no file is opened, not even where it was put in a file's or folder's place a moment ago.
 _READ: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+_ENTER: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,25 @@ class WatchedFolder:
                 if stat.S_ISREG(status.st_mode) and not name.startswith("."):
                     yield _Found(path, status.st_size, status.st_mtime_ns)
 
+    def _opened(self, path: Path) -> int:
+        """A descriptor of a file in the folder, reached step by step so that no link is followed on the way."""
+        *subfolders, name = path.relative_to(self._folder).parts
+        folder = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            for subfolder in subfolders:
+                inner = os.open(subfolder, _ENTER, dir_fd=folder)
+                os.close(folder)
+                folder = inner
+            return os.open(name, _READ, dir_fd=folder)
+        finally:
+            os.close(folder)
+
     def _take(self, found: _Found) -> bool:
         """Take a file, or warn that it cannot be used; false where there is no room for it now."""
         try:
             if found.size > self._max_file_bytes:
                 raise OSError(f"has {found.size} bytes, expected {self._max_file_bytes} at most")
-            with open(os.open(found.path, _READ), "rb") as stream:
+            with open(self._opened(found.path), "rb") as stream:
                 status = os.fstat(stream.fileno())
                 if not stat.S_ISREG(status.st_mode) or (status.st_size, status.st_mtime_ns) != found.version:
                     raise OSError("was replaced while it was looked at")

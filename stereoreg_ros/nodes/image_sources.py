@@ -1,0 +1,50 @@
+"""Who sends the slices: one source at a time, for of two at once nobody could tell whose axes a pose is in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+# A process that was killed is counted among the publishers until its lease has run out: 20 s in Fast DDS by default.
+LEASE_S: Final = 30.0
+# Of the identifier of a publisher, so much is that of its process.
+_PROCESS_BYTES: Final = 12
+
+
+class ImageSources:
+    """The publishers of the topics that make up a slice."""
+
+    def __init__(self, node: Node, inputs: Sequence[Subscription]) -> None:
+        self._node = node
+        self._inputs = inputs
+        self._seen_s: list[dict[bytes, float]] = [{} for _ in inputs]
+
+    def fault(self, now_s: float) -> str:
+        """Why slices cannot be told apart by their source at `now_s`, of a steady clock; nothing where they can.
+
+        Publishers of one process and node name are one source. Two processes of one node name are one that was killed
+        and the one in its place, unless they stay. To be called at least every few seconds, so that it is seen since
+        when they are there.
+        """
+        faults = [
+            self._fault_of(one.topic_name, seen, now_s) for one, seen in zip(self._inputs, self._seen_s, strict=True)
+        ]
+        return next(filter(None, faults), "")
+
+    def _fault_of(self, topic: str, seen_s: dict[bytes, float], now_s: float) -> str:
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        processes = {bytes(one.endpoint_gid)[:_PROCESS_BYTES] for one in publishers}
+        for gone in seen_s.keys() - processes:
+            del seen_s[gone]
+        for process in processes:
+            seen_s.setdefault(process, now_s)
+        names = sorted({f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers})
+        if len(names) > 1:
+            return f"{topic} is published by {' and '.join(names)} at once, expected one source of slices"
+        both_since_s = sorted(seen_s.values())[1:2]
+        if both_since_s and now_s - both_since_s[0] > LEASE_S:
+            return f"{topic} is published by {len(processes)} nodes called {names[0]} at once, expected one source of slices"
+        return ""
