@@ -13,6 +13,7 @@ import rclpy
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -74,7 +75,10 @@ class _Target(Node):
     """As register_node checks what is set, but by names of errors, and without the tables that it fills."""
 
     def __init__(self) -> None:
-        super().__init__("fuzzing", enable_rosout=False, start_parameter_services=False)
+        # Of its own, as the process may have others.
+        context = Context()
+        rclpy.init(context=context)
+        super().__init__("fuzzing", context=context, enable_rosout=False, start_parameter_services=False)
         declare_settings(self)
         self.add_on_set_parameters_callback(self._check)
 
@@ -93,8 +97,6 @@ class _Target(Node):
 
 @functools.cache
 def _target() -> _Target:
-    if not rclpy.ok():
-        rclpy.init()
     return _Target()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from fuzzing.kind import CORPUS, Kind
 from fuzzing.kinds import KINDS
 from fuzzing.outcome import outcome_of
 
+TESTS = Path(__file__).parent
 FOUND = [(kind, path) for kind in KINDS.values() for path in kind.found]
 
 
@@ -49,6 +51,13 @@ def test_valid_inputs_are_accepted_and_changed_ones_do_no_harm(kind: Kind) -> No
     assert 10 < accepted < 390
 
 
+@pytest.fixture
+def harmful_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that tries inputs finds `harmful_kinds`."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(TESTS), str(TESTS.parent))))
+
+
+@pytest.mark.usefixtures("harmful_found")
 @pytest.mark.parametrize(
     ("name", "told"),
     [
@@ -77,6 +86,7 @@ def test_harm_is_seen_and_kept(name: str, told: str, tmp_path: Path, monkeypatch
         assert b"!" in text.with_suffix(kind.ending).read_bytes()
 
 
+@pytest.mark.usefixtures("harmful_found")
 def test_what_does_no_harm_is_counted(tmp_path: Path) -> None:
     report = watch.run(HARMFUL["harmless"], 300, 1, tmp_path / "run", kinds="harmful_kinds")
     assert not report.findings

@@ -142,7 +142,9 @@ class NodeSettings:
         low, high = _SPACING_RANGE_MM
         if len(self.pixel_spacing) != 2:
             raise ValueError(f"pixel_spacing has {len(self.pixel_spacing)} numbers, expected two: [sx, sy] in mm/pixel")
-        if self.pixel_spacing != (0.0, 0.0) and not all(low <= spacing <= high for spacing in self.pixel_spacing):
+        numbers = all(isinstance(spacing, float | int) for spacing in self.pixel_spacing)
+        in_range = numbers and all(low <= spacing <= high for spacing in self.pixel_spacing)
+        if self.pixel_spacing != (0.0, 0.0) and not in_range:
             raise ValueError(
                 f"pixel_spacing is {list(self.pixel_spacing)}, "
                 f"expected two positive numbers of mm/pixel, from {low:g} to {high:g}"
