@@ -109,6 +109,24 @@ def test_slices_out_of_order_and_repeated(placed):
     assert answers == len(stamps)
 
 
+def test_a_stamp_before_1970_is_one_like_others_and_keeps_no_slice_waiting(placed):
+    hu, slice_from_frame = rendered(33)
+    # Whether slices wait for one another is up to the machine.
+    for burst in range(4):
+        stamps = [Time(sec=number - 20 * (burst + 1)) for number in range(10)] + [Time(sec=6000 + burst)]
+        for stamp in stamps:
+            placed.send_placed(hu, 0.0, stamp)
+
+        def all_answered(stamps=stamps) -> bool:
+            return all(of_stamp(placed.diagnostics, stamp) for stamp in stamps)
+
+        placed.client.wait_for(all_answered, "an answer to every slice")
+    before_1970 = [pose for pose in placed.poses if pose.header.stamp.sec < 0]
+    assert before_1970
+    for message in before_1970:
+        assert_near(pose_from_message(message), slice_from_frame)
+
+
 def test_the_same_slice_twice_gives_the_same_pose_and_another_of_its_stamp_none_that_is_wrong(placed):
     stamp = Time(sec=77, nanosec=1)
     one, other = rendered(30), rendered(31)

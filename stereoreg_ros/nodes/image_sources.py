@@ -46,8 +46,6 @@ class ImageSources:
             return f"{topic} is published by {' and '.join(names)} at once, expected one source of slices"
         both_since_s = sorted(seen_s.values())[1:2]
         if both_since_s and now_s - both_since_s[0] > LEASE_S:
-            return (
-                f"{topic} is published by {len(processes)} nodes called {names[0]} at once, "
-                "expected one source of slices"
-            )
+            count, name = len(processes), names[0]
+            return f"{topic} is published by {count} nodes called {name} at once, expected one source of slices"
         return ""

@@ -19,7 +19,6 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -133,10 +132,13 @@ class RegisterNode(Node):
         for late in self._backlog.take_late(time.time()):
             self._skip(late)
         image = self._backlog.take()
-        if image is not None:
-            self._pair(image)
-        if len(self._backlog):
-            self._more_wait.trigger()
+        try:
+            if image is not None:
+                self._pair(image)
+        finally:
+            # Whatever one slice does, the next has its turn.
+            if len(self._backlog):
+                self._more_wait.trigger()
 
     def _pair(self, image: Image) -> None:
         """Register an image with its slice_spacing and slice_pose, or let it wait for them."""
@@ -307,8 +309,9 @@ class RegisterNode(Node):
 
     def _count(self, header: Header) -> None:
         """Count a slice that was answered, with its latency."""
-        stamp = Time.from_msg(header.stamp, clock_type=self.get_clock().clock_type)
-        latency_ms = (self.get_clock().now() - stamp).nanoseconds / 1e6 if stamp.nanoseconds else float("nan")
+        # Not as a Time of rclpy, which knows none before 1970.
+        stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+        latency_ms = (self.get_clock().now().nanoseconds - stamp_ns) / 1e6 if stamp_ns else float("nan")
         self._stream.registered(time.monotonic(), latency_ms)
 
     def _publish_pictures(self, ct_slice: Slice, results: list[Registration | Refusal], header: Header) -> None:
