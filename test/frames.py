@@ -13,6 +13,14 @@ _LEAST_SINE = 0.08
 _LEAST_DISTANCE = 8.0
 
 
+def cube_by_hand() -> Frame:
+    """Six rods in a cube of 60 mm, all from the lower face to the upper one; no three coplanar, no two parallel."""
+    lower = np.array([[5, 10], [30, -30], [-20, 20], [25, -25], [-30, 30], [30, 30]])
+    upper = np.array([[30, 30], [30, 20], [-30, -30], [-25, -25], [0, 10], [-20, 25]])
+    starts, ends = (np.column_stack([face, np.full(6, z)]).astype(float) for face, z in ((lower, -30), (upper, 30)))
+    return Frame("by_hand", tuple("abcdef"), starts, ends, np.ones(6))
+
+
 def random_frame(rng: np.random.Generator, n: int) -> Frame:
     """A frame of `n` rods from the lower to the upper face of a cube of 60 mm about its origin, no two parallel."""
     starts: list[Array] = []

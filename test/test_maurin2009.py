@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from frames import cube_by_hand
 
-from stereoreg_ros import RegistrationOptions, load_frame, register_spots
+from stereoreg_ros import RegistrationOptions, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle
 from stereoreg_ros.geometry.projection import point_line_distances
@@ -26,7 +27,7 @@ ARRANGEMENTS = 360
 
 @pytest.fixture(scope="module")
 def cube() -> Frame:
-    return load_frame("cube6")
+    return cube_by_hand()
 
 
 def problem(seed: int, cube: Frame, false_spots: int = 0, visible: int = 6) -> SpotSet:
