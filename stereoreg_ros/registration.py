@@ -195,9 +195,10 @@ def _register(
         found = match_near(spots, frame, prior, options, scanner_from_slice.inverse() @ previous)
     if found is None:
         found = _MATCHERS[options.matcher](spots, frame, prior, options)
+    # How weakly a pose is determined matters of the best one: others are told only to say what they are.
     estimates = tuple(
-        _estimate(h, spots_px, weighted_px2, frame, scale, scanner_from_slice, scale_covariance)
-        for h in found.hypotheses
+        _estimate(h, rank == 0, spots_px, weighted_px2, frame, scale, scanner_from_slice, scale_covariance)
+        for rank, h in enumerate(found.hypotheses)
     )
     if found.given_up:
         return refuse("no_consensus", f"the search among {count} spots was {found.given_up}", estimates)
@@ -298,6 +299,7 @@ def _noise_mm(scale: PixelScale, noise_px: float) -> float:
 
 def _estimate(
     hypothesis: Hypothesis,
+    is_best: bool,
     spots_px: Array,
     weighted_px2: Array,
     frame: Frame,
@@ -311,7 +313,7 @@ def _estimate(
     spots = hypothesis.spot_of_line[lines]
     distances = point_line_distances(frame, lines, slice_from_frame, scale.to_mm(spots_px[spots]))
     covariance = _covariance(hypothesis.information)
-    if _is_weak(covariance):
+    if is_best and _is_weak(covariance):
         whitening = np.linalg.inv(np.linalg.cholesky(scale.matrix @ weighted_px2[spots] @ scale.matrix.T))
         covariance = covariance_along_valley(frame, slice_from_frame, lines, scale.to_mm(spots_px[spots]), whitening)
     if scale_covariance is not None:

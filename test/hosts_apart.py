@@ -39,7 +39,8 @@ QUEUE = 8
 QUEUE_FULL = 0xA700
 CUT_S, PERIOD_S = 10.0, 0.25
 # DDS repeats what was not acknowledged every three seconds; discovery, where it was lost, takes as long.
-AGAIN_S = 15.0
+# And a slice whose answer was lost is sent once more after fifteen.
+AGAIN_S = 45.0
 MULTICAST = "239.255.0.1"
 PROFILE = REPOSITORY / "config" / "fastdds_hosts.xml"
 assert f"<interface>{INTERFACE}</interface>" in PROFILE.read_text()
