@@ -69,30 +69,35 @@ def distinct(found: list[Hypothesis], gains: Array) -> list[Hypothesis]:
     for hypothesis in found:
         if scores[id(found[0])] - scores[id(hypothesis)] > _FAR_BEHIND:
             break
-        for row, other in enumerate(kept):
-            difference = _difference(hypothesis, other)
-            if _is_same(difference, hypothesis, other):
-                kept[row] = _widened(other, difference, score(other, gains) - score(hypothesis, gains))
-                break
+        differences = _differences(hypothesis, kept)
+        row = _row_of_same(differences, hypothesis, kept)
+        if row is not None:
+            other = kept[row]
+            kept[row] = _widened(other, differences[row], score(other, gains) - score(hypothesis, gains))
         else:
             kept.append(hypothesis)
     return kept
 
 
-def _difference(a: Hypothesis, b: Hypothesis) -> Array:
-    """Perturbation (6,) of `Pose.perturbed` that leads from b to a."""
-    turn = Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec()
-    return np.concatenate([a.translation - b.translation, turn])
+def _differences(hypothesis: Hypothesis, others: list[Hypothesis]) -> Array:
+    """Perturbations (k, 6) of `Pose.perturbed` that lead from each of the others to the hypothesis."""
+    if not others:
+        return np.empty((0, 6))
+    turns = Rotation.from_matrix(hypothesis.rotation @ np.array([one.rotation.T for one in others])).as_rotvec()
+    return np.hstack([hypothesis.translation - np.array([one.translation for one in others]), turns])
 
 
-def _is_same(difference: Array, a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether two poses belong to one valley: between them chi-square hardly rises over its values at both.
+def _row_of_same(differences: Array, hypothesis: Hypothesis, others: list[Hypothesis]) -> int | None:
+    """The first of others in whose valley a pose lies: between them chi-square hardly rises over its values at both.
 
     Two optima at distance d (Mahalanobis, by the curvature at either) of a double well are parted by a ridge of d^2/16.
+    differences: (k, 6), see `_differences`.
     """
-    if np.linalg.norm(difference[3:]) > _LARGEST_VALLEY:
-        return False
-    return max(float(difference @ h.information @ difference) for h in (a, b)) < 16 * _RIDGE
+    for row in np.flatnonzero(np.linalg.norm(differences[:, 3:], axis=1) <= _LARGEST_VALLEY):
+        informations = (hypothesis.information, others[row].information)
+        if max(float(differences[row] @ one @ differences[row]) for one in informations) < 16 * _RIDGE:
+            return int(row)
+    return None
 
 
 def _widened(hypothesis: Hypothesis, difference: Array, behind: float) -> Hypothesis:
