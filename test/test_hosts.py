@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("rclpy", reason="ROS 2 is not there")
+
 HOSTS_APART = Path(__file__).with_name("hosts_apart.py")
 
 

@@ -11,10 +11,8 @@ import numpy as np
 from stereoreg_ros.geometry.pose import rotation_exp
 from stereoreg_ros.matching.hypothesis import Hypothesis
 from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.solvers.likelihood_valley import ARM_MM, UNITS
 
-# A turn counts as what it moves at this distance.
-_ARM_MM = 50.0
-_UNITS = np.array([1.0, 1.0, 1.0, _ARM_MM, _ARM_MM, _ARM_MM])
 # Directions, and the distances from the pose at which to start: to both sides, as far as it can turn and be met.
 _DIRECTIONS, _DISTANCES_MM = 2, np.arange(8.0, 49.0, 8.0)
 # Of a pose that is known better in every direction, no second one is in the same valley.
@@ -23,12 +21,12 @@ _WEAK_MM = 0.5
 
 def starts_along_valley(hypothesis: Hypothesis) -> Starts:
     """Starts away from a pose along its weakest directions, with its spots; none where it has no weak one."""
-    values, vectors = np.linalg.eigh(hypothesis.information / np.outer(_UNITS, _UNITS))
+    values, vectors = np.linalg.eigh(hypothesis.information / np.outer(UNITS, UNITS))
     weak = np.flatnonzero(values[:_DIRECTIONS] < 1 / _WEAK_MM**2)
     distances = np.concatenate([_DISTANCES_MM, -_DISTANCES_MM])
     steps = (distances[:, None] * vectors.T[weak, None]).reshape(-1, 6)
     return Starts(
-        rotation_exp(steps[:, 3:] / _ARM_MM) @ hypothesis.rotation,
+        rotation_exp(steps[:, 3:] / ARM_MM) @ hypothesis.rotation,
         hypothesis.translation + steps[:, :3],
         np.tile(hypothesis.spot_of_line, (len(steps), 1)),
         np.arange(len(steps)),

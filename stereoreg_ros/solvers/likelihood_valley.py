@@ -17,10 +17,10 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.solvers.maximum_likelihood import Evaluated, evaluate
 
-# A turn counts as what it moves at this distance, so that directions of position and rotation can be compared.
-_ARM_MM = 50.0
-_UNITS = np.array([1.0, 1.0, 1.0, _ARM_MM, _ARM_MM, _ARM_MM])
-# The first step, of a standard deviation along the valley; each next one is longer, and two corrections bring it back
+# A turn counts as what it moves at this distance: units in which directions of position and rotation can be compared.
+ARM_MM = 50.0
+UNITS = np.array([1.0, 1.0, 1.0, ARM_MM, ARM_MM, ARM_MM])
+# The first step, of a standard deviation along the valley; each next one is longer, and corrections bring it back
 # to the valley's floor. Where chi-square has risen so far, less than a thousandth of the likelihood is left.
 _FIRST_STEP, _LENGTHENED, _CORRECTIONS, _STEPS = 0.4, 1.1, 3, 24
 _RISE = 16.0
@@ -66,7 +66,7 @@ def covariance_along_valley(
         along = weakest * np.where((weakest * along).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         across, volume = _across(information, along)
         turned = Rotation.from_matrix(rotations @ rotation.T).as_rotvec()
-        moved.append(np.concatenate([translations - translation, _ARM_MM * turned], axis=1))
+        moved.append(np.concatenate([translations - translation, ARM_MM * turned], axis=1))
         log_likelihood.append(np.where(walking, volume - log_volume - 0.5 * (state.chi_square - lowest), -np.inf))
         covariance_across.append(across)
         if not walking.any():
@@ -80,17 +80,17 @@ def covariance_along_valley(
     shares *= np.exp(np.array(log_likelihood))
     moments = np.where(shares[..., None, None] > 0, places[..., :, None] * places[..., None, :] + covariance_across, 0)
     mean = np.einsum("ks,ksij->ij", shares, moments) / shares.sum()
-    covariance: Array = mean / np.outer(_UNITS, _UNITS)
+    covariance: Array = mean / np.outer(UNITS, UNITS)
     return covariance
 
 
 def _in_units(information: Array) -> Array:
-    return information / np.outer(_UNITS, _UNITS)
+    return information / np.outer(UNITS, UNITS)
 
 
 def _moved(rotations: Array, translations: Array, steps: Array) -> tuple[Array, Array]:
     """Poses (2, 3, 3), (2, 3) mm after steps (2, 6) mm."""
-    return rotation_exp(steps[:, 3:] / _ARM_MM) @ rotations, translations + steps[:, :3]
+    return rotation_exp(steps[:, 3:] / ARM_MM) @ rotations, translations + steps[:, :3]
 
 
 def _across(information: Array, along: Array) -> tuple[Array, Array]:
@@ -107,7 +107,7 @@ def _to_floor(state: Evaluated, along: Array, longest_mm: float) -> Array:
     """Steps (2, 6) mm at right angles to `along` that lead down to the valley's floor; none where there is no way."""
     line = along[:, :, None] * along[:, None, :]
     rest = np.eye(6) - line
-    information, gradient = _in_units(state.information), state.gradient / _UNITS
+    information, gradient = _in_units(state.information), state.gradient / UNITS
     known = np.isfinite(information).all(axis=(1, 2)) & np.isfinite(gradient).all(axis=1)
     information = np.where(known[:, None, None], information, np.eye(6))
     gradient = np.where(known[:, None], gradient, 0.0)
