@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image
 
 from stereoreg_ros.nodes.diagnostic_status import NAME
 
@@ -66,6 +67,6 @@ class Listener(Node):
                     self.heard.refused[stamp] = values["reason"]
 
 
-def nanoseconds(message: PoseStamped | DiagnosticArray) -> int:
+def nanoseconds(message: PoseStamped | DiagnosticArray | Image) -> int:
     """A message's stamp."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)

@@ -1,7 +1,9 @@
 """`python -m benchmarks.streaming`: slices over DDS at a steady rate; scanner, node and listener are processes.
 
 512 x 512 pixels, six rods and 24 false spots. Latency is from an image's stamp, taken just before it is published, to
-the arrival of its pose here. CPU is of the node alone, 100 % being one core.
+the arrival of its pose here. CPU is of the node alone, 100 % being one core. The unit Y is timed without pauses. A
+computer that rests between two slices is slower when the next comes; what Y itself takes then, and an image alone on
+its way, is told beside.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import rclpy
 from tqdm import tqdm
 
 from benchmarks.answers import Answers, Listener
+from benchmarks.bare_transport import bare_transport_s
 from benchmarks.register_process import DEADLINE_S, Load, LoadMeter, RegisterProcess
 from benchmarks.slice_source import WARM_UP
 from benchmarks.yardstick import Yardstick
@@ -29,13 +32,15 @@ from benchmarks.yardstick import Yardstick
 P50_Y, P99_Y = 8.0, 30.0
 RATE_HZ, FAST_HZ = 10.0, 30.0
 _SILENCE_S: Final = 10.0
+_ALONE: Final = 100
 
 
 @dataclass
 class Stream:
     """What became of the slices sent at one rate; times in s, by slice in the order sent.
 
-    quarters_s: median latency of each quarter of the stream.
+    quarters_s: median latency of each quarter of the stream. paced_yardstick_s: median of one yardstick after each
+    pose; transport_s: median of an image's way to a subscriber that does nothing else.
     """
 
     rate_hz: float
@@ -48,9 +53,13 @@ class Stream:
     inside_p50_s: float
     quarters_s: list[float]
     load: Load
+    paced_yardstick_s: float
+    transport_s: float
 
 
-def _stream(listener: Listener, node: RegisterProcess, rate: float, slices: int) -> Stream:
+def _stream(
+    listener: Listener, node: RegisterProcess, yardstick: Yardstick, rate: float, slices: int, transport_s: float
+) -> Stream:
     command = [sys.executable, "-m", "benchmarks.slice_source", "--rate", str(rate), "--slices", str(slices)]
     heard = listener.heard = Answers()
     source = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -60,6 +69,7 @@ def _stream(listener: Listener, node: RegisterProcess, rate: float, slices: int)
     meter = LoadMeter(node.process)
     answered, last_s, load = 0, time.monotonic(), meter.load()
     stamps: list[int] = []
+    paced: list[float] = []
     with tqdm(total=WARM_UP + slices, desc=f"{rate:g} Hz", unit="slice", disable=None, leave=False) as bar:
         while not stamps or not heard.statuses.keys() >= set(stamps):
             rclpy.spin_once(listener, timeout_sec=0.1)
@@ -68,6 +78,9 @@ def _stream(listener: Listener, node: RegisterProcess, rate: float, slices: int)
                 bar.update(answered - bar.n)
             elif stamps and time.monotonic() > last_s + _SILENCE_S:
                 break
+            # Not before the pose has come, which would wait for it.
+            if min(len(heard.poses), answered) > len(paced):
+                paced.append(yardstick.once())
             if not stamps and source.poll() is not None:
                 stamps = [int(line) for line in source.stdout.read().split()]
                 if source.returncode or not stamps:
@@ -88,6 +101,8 @@ def _stream(listener: Listener, node: RegisterProcess, rate: float, slices: int)
         inside_p50_s=float(np.median([heard.inside_s[stamp] for stamp in stamps if stamp in heard.inside_s])),
         quarters_s=[float(np.median(part)) for part in np.array_split(latencies, 4)],
         load=load,
+        paced_yardstick_s=float(np.median(paced)),
+        transport_s=transport_s,
     )
 
 
@@ -103,6 +118,9 @@ def _print(stream: Stream, unit: float) -> None:
     for name, value in (("p50", stream.p50_s), ("p99", stream.p99_s), ("longest", stream.longest_s)):
         print(f"  image to pose, {name:8s} {1e3 * value:7.1f} ms = {value / unit:6.1f} Y")
     print(f"  median by quarters of the stream: {quarters} ms; within the node: {1e3 * stream.inside_p50_s:.1f} ms")
+    pauses = f"Y between two slices {1e3 * stream.paced_yardstick_s:.1f} ms, so p50 is"
+    print(f"  {pauses} {stream.p50_s / stream.paced_yardstick_s:.1f} of those")
+    print(f"  of it, an image alone to a bare subscriber: {1e3 * stream.transport_s:.1f} ms")
     print(f"  CPU {stream.load.cpu_percent:.0f} %, memory {stream.load.memory_mib:.0f} MiB", flush=True)
 
 
@@ -120,9 +138,11 @@ def main() -> int:
     # Nobody else is heard or disturbed.
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    unit = Yardstick().unit()
+    yardstick = Yardstick()
+    unit = yardstick.unit()
     print(f"Y = {1e3 * unit:.2f} ms: threshold and connected components of a 512 x 512 slice")
     rclpy.init()
+    transport_s = {rate: bare_transport_s(rate, min(_ALONE, arguments.slices)) for rate in (RATE_HZ, FAST_HZ)}
     listener = Listener("streaming_listener")
     with tempfile.TemporaryFile() as log:
         node = RegisterProcess(log)
@@ -139,7 +159,7 @@ def main() -> int:
             )
             streams = []
             for rate in (RATE_HZ, FAST_HZ):
-                streams.append(_stream(listener, node, rate, arguments.slices))
+                streams.append(_stream(listener, node, yardstick, rate, arguments.slices, transport_s[rate]))
                 _print(streams[-1], unit)
         finally:
             node.end()

@@ -73,6 +73,20 @@ def test_two_images_of_one_stamp_are_refused_a_pose_that_may_be_of_either():
     assert poses.take_overdue(now_s=WAIT_S) is second
 
 
+def test_pose_of_an_image_that_is_given_up_meets_no_later_one():
+    for pose_first in (True, False):
+        poses, known = slice_poses(), pose(2.0)
+        if pose_first:
+            poses.add(Time(sec=1), pose(1.0))
+        poses.give_up(Time(sec=1))
+        if not pose_first:
+            assert poses.add(Time(sec=1), pose(1.0)) is None
+        assert poses.take(Time(sec=1)) is None
+        # Those that come after belong to the later image.
+        poses.add(Time(sec=1), known)
+        assert poses.take(Time(sec=1)) is known
+
+
 def test_neither_poses_nor_images_pile_up():
     poses = slice_poses()
     for sec in range(100):

@@ -39,10 +39,14 @@ class ByStamp(Generic[_Part, _Whole]):
         self._same = same
         self._parts: OrderedDict[_Stamp, _Part | MessageError] = OrderedDict()
         self._waiting: deque[_Waiting[_Whole]] = deque()
+        self._given_up: deque[_Stamp] = deque(maxlen=_CAPACITY)
 
     def add(self, stamp: Time, part: _Part | MessageError) -> tuple[_Whole, _Part | MessageError] | None:
         """Take a part; returns it with the whole that waited for it, or keeps it for the whole to come."""
         key = _key(stamp)
+        if key in self._given_up:
+            self._given_up.remove(key)
+            return None
         of_stamp = [waiting for waiting in self._waiting if waiting.stamp == key]
         if of_stamp:
             self._waiting.remove(of_stamp[0])
@@ -65,6 +69,11 @@ class ByStamp(Generic[_Part, _Whole]):
     def take(self, stamp: Time) -> _Part | MessageError | None:
         """The part with this stamp; None where none has come yet."""
         return self._parts.pop(_key(stamp), None)
+
+    def give_up(self, stamp: Time) -> None:
+        """A whole is not to meet its part, which may be here or yet to come: it must not meet a later whole instead."""
+        if self._parts.pop(_key(stamp), None) is None:
+            self._given_up.append(_key(stamp))
 
     def wait(self, stamp: Time, whole: _Whole, now_s: float) -> None:
         """Let a whole wait for its part, from `now_s` in seconds of a steady clock."""

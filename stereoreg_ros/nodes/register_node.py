@@ -12,7 +12,6 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped, Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
@@ -31,7 +30,7 @@ from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.nodes import conversions
 from stereoreg_ros.nodes.backlog import MOST_WAIT_S, Backlog, received_s, waiting_in
-from stereoreg_ros.nodes.by_stamp import WAIT_S, ByStamp
+from stereoreg_ros.nodes.companion import Companion
 from stereoreg_ros.nodes.conversions import MessageError
 from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING, status_of, status_of_unusable
 from stereoreg_ros.nodes.frame_output import FrameOutput, FrameTopics
@@ -62,7 +61,7 @@ class _Unregistered:
     """An image and the pixel spacing that it came with; None where it came with none."""
 
     image: Image
-    spacing: PixelScale | MessageError | None
+    spacing: PixelScale | None
 
 
 class RegisterNode(Node):
@@ -82,9 +81,6 @@ class RegisterNode(Node):
         self._spare_time = self.create_timer(_SPARE_TIME_S, self._prepare_in_spare_time, clock=steady)
         self._frame_fault = self._load_start_frames()
         self._backlog = Backlog()
-        self._slice_spacings: ByStamp[PixelScale, Image] = ByStamp("slice_spacing", PixelScale.__eq__)
-        self._slice_poses: ByStamp[Pose, _Unregistered] = ByStamp("slice_pose", _same_pose)
-        self._slice_spacing_seen = self._slice_pose_seen = False
         self._target: PointStamped | None = None
         self._stream = StreamStatus(time.monotonic())
         self._send_transform: Callable[[TransformStamped], None] | None = None
@@ -94,12 +90,27 @@ class RegisterNode(Node):
         self._overlay = publisher_of(self, Image, "overlay", QUEUE)
         self._markers = publisher_of(self, MarkerArray, "markers", QUEUE)
         # The image last: where all are there, rclpy serves them in this order and no image has to wait.
-        self._slice_spacing_input = subscription_of(
-            self, Vector3Stamped, "slice_spacing", self._on_slice_spacing, QUEUE
+        self._slice_spacing: Companion[PixelScale, Image] = Companion(
+            self,
+            Vector3Stamped,
+            "slice_spacing",
+            conversions.scale_from_message,
+            same=PixelScale.__eq__,
+            required=lambda: False,
+            met=self._pair_with_pose,
         )
-        self._slice_pose_input = subscription_of(self, PoseStamped, "slice_pose", self._on_slice_pose, QUEUE)
+        self._slice_pose: Companion[Pose, _Unregistered] = Companion(
+            self,
+            PoseStamped,
+            "slice_pose",
+            conversions.pose_from_message,
+            same=_same_pose,
+            required=lambda: self.settings.slice_pose_required,
+            met=self._register,
+        )
         self._image_input = subscription_of(self, Image, "image", self._on_image, QUEUE)
-        self._sources = ImageSources(self, (self._image_input, self._slice_pose_input, self._slice_spacing_input))
+        inputs = self._image_input, self._slice_pose.subscription, self._slice_spacing.subscription
+        self._sources = ImageSources(self, inputs)
         subscription_of(self, PointStamped, "target", self._on_target, QUEUE)
         self._more_wait = self.create_guard_condition(self._register_next)
         self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=steady)
@@ -134,82 +145,24 @@ class RegisterNode(Node):
         image = self._backlog.take()
         try:
             if image is not None:
-                self._pair(image)
+                self._slice_spacing.meet(image.header.stamp, image)
         finally:
             # Whatever one slice does, the next has its turn.
             if len(self._backlog):
                 self._more_wait.trigger()
 
-    def _pair(self, image: Image) -> None:
-        """Register an image with its slice_spacing and slice_pose, or let it wait for them."""
-        stamp = image.header.stamp
-        if not self._slice_spacing_expected():
-            self._pair_with_pose(_Unregistered(image, None))
-        elif stamp == TimeMessage():
-            self._register(_Unregistered(image, _NO_STAMP), _NO_STAMP)
-        elif (spacing := self._slice_spacings.take(stamp)) is not None:
-            self._pair_with_pose(_Unregistered(image, spacing))
+    def _pair_with_pose(self, image: Image, spacing: PixelScale | MessageError | None) -> None:
+        if isinstance(spacing, MessageError):
+            self._slice_pose.give_up(image.header.stamp)
+            self._register(_Unregistered(image, None), spacing)
         else:
-            self._slice_spacings.wait(stamp, image, time.monotonic())
-
-    def _pair_with_pose(self, unregistered: _Unregistered) -> None:
-        stamp = unregistered.image.header.stamp
-        if not self._slice_pose_expected():
-            self._register(unregistered, Pose.identity())
-        elif stamp == TimeMessage():
-            self._register(unregistered, _NO_STAMP)
-        elif (scanner_from_slice := self._slice_poses.take(stamp)) is not None:
-            self._register(unregistered, scanner_from_slice)
-        else:
-            self._slice_poses.wait(stamp, unregistered, time.monotonic())
-
-    def _on_slice_spacing(self, message: Vector3Stamped) -> None:
-        self._slice_spacing_seen = True
-        spacing: PixelScale | MessageError
-        try:
-            spacing = conversions.scale_from_message(message)
-        except MessageError as error:
-            spacing = MessageError(f"slice_spacing: {error}")
-            self.get_logger().warning(str(spacing))
-        met = self._slice_spacings.add(message.header.stamp, spacing)
-        if met is not None:
-            self._pair_with_pose(_Unregistered(*met))
-
-    def _on_slice_pose(self, message: PoseStamped) -> None:
-        self._slice_pose_seen = True
-        scanner_from_slice: Pose | MessageError
-        try:
-            scanner_from_slice = conversions.pose_from_message(message)
-        except MessageError as error:
-            scanner_from_slice = MessageError(f"slice_pose: {error}")
-            self.get_logger().warning(str(scanner_from_slice))
-        met = self._slice_poses.add(message.header.stamp, scanner_from_slice)
-        if met is not None:
-            self._register(*met)
+            self._slice_pose.meet(image.header.stamp, _Unregistered(image, spacing))
 
     def _refuse_overdue(self) -> None:
-        now_s = time.monotonic()
-        while (image := self._slice_spacings.take_overdue(now_s)) is not None:
-            fault = MessageError(f"no slice_spacing with the image's stamp came within {WAIT_S:g} s")
-            self._register(_Unregistered(image, fault), fault)
-        while (unregistered := self._slice_poses.take_overdue(now_s)) is not None:
-            fault = MessageError(f"no slice_pose with the image's stamp came within {WAIT_S:g} s")
-            self._register(unregistered, fault)
+        self._slice_spacing.refuse_overdue()
+        self._slice_pose.refuse_overdue()
 
-    # Who publishes slices has announced their spacings and poses before their images, and DDS keeps that order: by the
-    # time of the first image it is known what comes with it.
-
-    def _slice_spacing_expected(self) -> bool:
-        return self._slice_spacing_seen or self.count_publishers(self._slice_spacing_input.topic_name) > 0
-
-    def _slice_pose_expected(self) -> bool:
-        return (
-            self.settings.slice_pose_required
-            or self._slice_pose_seen
-            or self.count_publishers(self._slice_pose_input.topic_name) > 0
-        )
-
-    def _register(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError) -> None:
+    def _register(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError | None) -> None:
         """Register one image and publish what came of it; whatever is in the image, the node lives on."""
         started, came_s = time.perf_counter(), time.monotonic()
         image = unregistered.image
@@ -247,17 +200,14 @@ class RegisterNode(Node):
 
     def _skip(self, image: Image) -> None:
         """Answer an image that is not registered, since newer ones wait; the latest pose stays as it is."""
-        # Left behind, these might be taken for those of a later image with its stamp.
-        self._slice_spacings.take(image.header.stamp)
-        self._slice_poses.take(image.header.stamp)
+        self._slice_spacing.give_up(image.header.stamp)
+        self._slice_pose.give_up(image.header.stamp)
         message = f"skipped for a newer slice: it had waited for over {MOST_WAIT_S:g} s"
         statuses = self._unusable("skipped", message, image.header.frame_id, 0.0)
         self._publish_statuses(statuses, image.header)
 
-    def _slice_from(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError) -> Slice:
+    def _slice_from(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError | None) -> Slice:
         image, spacing = unregistered.image, unregistered.spacing
-        if isinstance(spacing, MessageError):
-            raise spacing
         if isinstance(scanner_from_slice, MessageError):
             raise scanner_from_slice
         if fault := self._sources.fault(time.monotonic()):
@@ -268,7 +218,7 @@ class RegisterNode(Node):
         if spacing is not None and not self._scale.stands_for(spacing):
             raise MessageError(f"{OTHER_SPACING} {spacing}, expected that which was told, {self._scale.configured}")
         hu = conversions.hu_from_image(image, settings.rescale_slope, settings.rescale_intercept)
-        return Slice(hu, settings.scale, scanner_from_slice)
+        return Slice(hu, settings.scale, Pose.identity() if scanner_from_slice is None else scanner_from_slice)
 
     def _axes_of(self, frame: Frame) -> str:
         """Name of a frame's axes in messages: the parameter's where it is alone, else its own."""
@@ -471,9 +421,6 @@ class RegisterNode(Node):
 # What the matcher's tables depend on.
 _OF_THE_TABLES = {"pixel_spacing", "spot_noise_px", "matcher", "nominal_orientation", "max_rotation_deg", "min_inliers"}
 _NO_TF2 = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
-
-
-_NO_STAMP = MessageError("its stamp is 0, expected one by which to know its slice_spacing and slice_pose")
 
 
 def _same_pose(one: Pose, other: Pose) -> bool:

@@ -58,11 +58,11 @@ def centres_of_symmetry(
         centres = centres + np.clip(compared.step, -0.5, 0.5)
     inverse = _inverse(_regular(compared.information))
     height = np.abs(patches).max(axis=(1, 2))
-    variance = _moderated(compared.variance, noise_hu2, height)
-    covariances = variance[:, None, None] * (inverse @ compared.by_noise @ inverse)
+    variance = _variance(compared)
+    covariances = _moderated(variance, noise_hu2, height)[:, None, None] * (inverse @ _by_noise(compared) @ inverse)
     # Where more than noise disturbs the symmetry, as the end of a rod within the slice or a bubble in a tube, there is
     # no centre of symmetry: the centroid is taken, and what the two differ by is an error.
-    lame = (compared.variance > _MOST_NOISE * noise_hu2) & (compared.variance > (_MOST_ODD * height) ** 2)
+    lame = (variance > _MOST_NOISE * noise_hu2) & (variance > (_MOST_ODD * height) ** 2)
     differs = np.where(lame[:, None], centres - rough, 0.0)
     covariances += differs[:, :, None] * differs[:, None, :]
     centres = np.where(lame[:, None], rough, centres)
@@ -100,32 +100,34 @@ def _share_left(patches: Array, shut: NDArray[np.bool_], clipped: NDArray[np.boo
 
 
 class _Compared(NamedTuple):
-    """Spots and their mirror images: step (n, 2) pixel to a better centre; information (n, 2, 2) HU^2 per pixel^2;
-    variance (n,) HU^2 of a pixel, by how the two differ; by_noise (n, 2, 2) HU^2 per pixel^2, covariance of information
-    times step for a unit of it.
+    """Spots (n, p, p) and their mirror images: odd, HU, what they differ by; weight of each pixel; slopes, HU/pixel,
+    along u and v, weighted; mirrors (n, p, p), the matrices of `_mirror` along u and v; information (n, 2, 2) HU^2 per
+    pixel^2; step (n, 2) pixel to a better centre.
     """
 
-    step: Array
+    odd: Array
+    weight: Array
+    slopes: tuple[Array, Array]
+    mirrors: tuple[Array, Array]
     information: Array
-    variance: Array
-    by_noise: Array
+    step: Array
 
 
 def _compared(patches: Array, centres: Array, window: Array, shut: NDArray[np.bool_]) -> _Compared:
     side = patches.shape[1]
     place = np.arange(side)
     (mirror_u, mirror_v), (near_u, near_v) = _mirror(centres.T, side)
-    turned_u = np.swapaxes(mirror_u, 1, 2)
-    mirrored = mirror_v @ patches @ turned_u
+    mirrored = mirror_v @ patches @ np.swapaxes(mirror_u, 1, 2)
     off_u, off_v = place - centres[:, 0, None], place - centres[:, 1, None]
     distance = (window[:, 0, 0, None] * off_u**2)[:, None, :] + (window[:, 1, 1, None] * off_v**2)[:, :, None]
     distance += (2 * window[:, 0, 1, None] * off_v)[:, :, None] * off_u[:, None, :]
     weight = np.exp(-0.5 * distance**2)
     # What lies on a shut pixel, or has its mirror image near one, or beyond the patch, is not compared.
-    blocked = np.where(shut, 1.0, 0.0)
-    blocked += near_v @ blocked @ np.swapaxes(near_u, 1, 2)
-    within = (near_v.any(axis=2)[:, :, None]) & (near_u.any(axis=2)[:, None, :])
-    weight *= (blocked == 0) & within
+    weight *= near_v.any(axis=2)[:, :, None] & near_u.any(axis=2)[:, None, :]
+    if shut.any():
+        blocked = shut.astype(np.float64)
+        blocked += near_v @ blocked @ np.swapaxes(near_u, 1, 2)
+        weight *= blocked == 0
     even, odd = 0.5 * (patches + mirrored), patches - mirrored
     slope_u, slope_v = np.zeros_like(even), np.zeros_like(even)
     slope_u[:, :, 2:-2] = (8 * (even[:, :, 3:-1] - even[:, :, 1:-3]) - (even[:, :, 4:] - even[:, :, :-4])) / 12
@@ -137,18 +139,29 @@ def _compared(patches: Array, centres: Array, window: Array, shut: NDArray[np.bo
     information[:, 0, 1] = information[:, 1, 0] = np.einsum("nij,nij->n", weighted_u, slope_v)
     pull = np.stack([np.einsum("nij,nij->n", part, odd) for part in (weighted_u, weighted_v)], axis=-1)
     step = -0.5 * np.linalg.solve(_regular(information), pull[..., None])[..., 0]
+    return _Compared(odd, weight, (weighted_u, weighted_v), (mirror_u, mirror_v), information, step)
+
+
+def _variance(compared: _Compared) -> Array:
+    """Variance (n,) HU^2 of a pixel, by how a spot and its mirror image differ."""
+    mirror_u, mirror_v = compared.mirrors
+    weight, odd = compared.weight, compared.odd
     # Between pixels the noise of the mirror image is less than a pixel's. Each pair of pixels counts twice, and the
     # centre takes two pairs' worth.
     noise = 1.0 + (mirror_v**2).sum(axis=2)[:, :, None] * (mirror_u**2).sum(axis=2)[:, None, :]
     pairs = 0.5 * weight.sum(axis=(1, 2))
-    variance = np.einsum("nij,nij,nij->n", weight, odd, odd) / np.maximum(np.einsum("nij,nij->n", weight, noise), 1e-9)
+    variance: Array = np.einsum("nij,nij,nij->n", weight, odd, odd)
+    variance /= np.maximum(np.einsum("nij,nij->n", weight, noise), 1e-9)
     variance *= np.maximum(pairs, 1.0) / np.maximum(pairs - 2.0, 1.0)
+    return variance + _ROUNDING_HU2
+
+
+def _by_noise(compared: _Compared) -> Array:
+    """Covariance (n, 2, 2) HU^2 per pixel^2 of information times step, for a unit of noise in each pixel."""
+    mirror_u, mirror_v = compared.mirrors
     # A pixel's noise pulls at the centre by itself and by what it is of the mirror image.
-    pulls = np.stack(
-        [part - np.swapaxes(mirror_v, 1, 2) @ part @ mirror_u for part in (weighted_u, weighted_v)], axis=1
-    )
-    by_noise = 0.25 * np.einsum("naij,nbij->nab", pulls, pulls)
-    return _Compared(step, information, variance + _ROUNDING_HU2, by_noise)
+    pulls = np.stack([part - np.swapaxes(mirror_v, 1, 2) @ part @ mirror_u for part in compared.slopes], axis=1)
+    return np.asarray(0.25 * np.einsum("naij,nbij->nab", pulls, pulls), dtype=np.float64)
 
 
 def _mirror(centres: Array, side: int) -> tuple[Array, Array]:
