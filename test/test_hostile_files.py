@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from test_calibration_file import content as calibration_content
 
 from stereoreg_ros.calibration_file import CalibrationFileError, load_calibration
-from stereoreg_ros.codestream import require_rle_size, size_of
 from stereoreg_ros.dicom import DicomError, read_frames
+from stereoreg_ros.dicom.codestream import require_rle_size, size_of
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.slice import PixelScale

@@ -16,10 +16,10 @@ from dicom_files import write_enhanced_ct, write_slice
 from pydicom import uid
 from pydicom.encaps import encapsulate
 
-from stereoreg_ros import dicom
-from stereoreg_ros.codestream import CodestreamSize, size_of
 from stereoreg_ros.dicom import DicomError, read_frames, read_slice
-from stereoreg_ros.multiframe import single_frame
+from stereoreg_ros.dicom import dataset as dicom_dataset
+from stereoreg_ros.dicom.codestream import CodestreamSize, size_of
+from stereoreg_ros.dicom.multiframe import single_frame
 
 MAX_BYTES = 2**20
 STORED = (1000 + np.arange(40 * 56).reshape(40, 56) % 777).astype(np.uint16)
@@ -119,7 +119,7 @@ def test_of_a_jpeg_2000_file_the_image_in_its_box_counts(tmp_path):
 
 
 def test_files_are_bounded_as_well(tmp_path, monkeypatch):
-    monkeypatch.setattr(dicom, "_MAX_INFLATED_BYTES", 2**16)
+    monkeypatch.setattr(dicom_dataset, "_MAX_INFLATED_BYTES", 2**16)
     small, large = (write_slice(tmp_path / f"{side}.dcm", np.zeros((side, side), np.uint16)) for side in (64, 256))
     for path in (small, large):
         dataset = pydicom.dcmread(path)
