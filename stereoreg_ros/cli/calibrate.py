@@ -12,7 +12,7 @@ from stereoreg_ros.calibration import Calibration
 from stereoreg_ros.calibration_series import SeriesScale, scale_of_series
 from stereoreg_ros.cli.output import NAME_WIDTH, complain, print_line, progress_bar
 from stereoreg_ros.cli.parsing import BAD_FILE, OK, Commands, WrongCallError, add_options, given
-from stereoreg_ros.cli.series import slices_of
+from stereoreg_ros.cli.series import add_series_and_frame, slices_of
 from stereoreg_ros.dicom import DicomError
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.slice import Slice
@@ -28,8 +28,7 @@ def add_to(commands: Commands) -> None:
         "alone, beside what the files say.",
         allow_abbrev=False,
     )
-    calibrate.add_argument("paths", metavar="PATH", nargs="+", type=Path, help="DICOM file, or folder with one series")
-    calibrate.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
+    add_series_and_frame(calibrate)
     calibrate.add_argument("--json", action="store_true", help="print one JSON object")
     calibrate.add_argument("--plot", metavar="FILE", type=Path, help="write a picture of the scale slice by slice, PNG")
     add_options(calibrate.add_argument_group("calibration"), CalibrationOptions)

@@ -16,7 +16,7 @@ import numpy as np
 
 from stereoreg_ros.cli.output import NAME_WIDTH, complain, print_line
 from stereoreg_ros.cli.parsing import BAD_FILE, OK, Commands, WrongCallError, add_options, given, make_folder
-from stereoreg_ros.cli.series import slices_of
+from stereoreg_ros.cli.series import add_series_and_frame, slices_of
 from stereoreg_ros.dicom import DicomError
 from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
@@ -61,8 +61,7 @@ def add_to(commands: Commands) -> None:
         "believed is refused with the reason; that is no error.",
         allow_abbrev=False,
     )
-    register.add_argument("paths", metavar="PATH", nargs="+", type=Path, help="DICOM file, or folder with one series")
-    register.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
+    add_series_and_frame(register)
     register.add_argument("--json", action="store_true", help="print one JSON object per slice, each on a line")
     register.add_argument("--overlay", metavar="DIR", type=Path, help="write a picture of each slice to this folder")
     register.add_argument(

@@ -1,7 +1,8 @@
-"""The slices that a command is given."""
+"""The slices that a command is given, and the frame that it looks for in them."""
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +12,12 @@ from tqdm import tqdm
 from stereoreg_ros.cli.output import complain
 from stereoreg_ros.dicom import DicomError, read_series, read_slice
 from stereoreg_ros.geometry.slice import Slice
+
+
+def add_series_and_frame(parser: argparse.ArgumentParser) -> None:
+    """The arguments `paths` and `frame`."""
+    parser.add_argument("paths", metavar="PATH", nargs="+", type=Path, help="DICOM file, or folder with one series")
+    parser.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
 
 
 def slices_of(paths: Sequence[Path]) -> Iterator[tuple[Path, Slice | DicomError]]:
