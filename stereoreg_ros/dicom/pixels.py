@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydicom.uid import UID, RLELossless
 
 from stereoreg_ros.dicom.codestream import CodestreamSize, require_rle_size, size_of
+from stereoreg_ros.dicom.decoding import decoded
 from stereoreg_ros.dicom.elements import DicomError, element_fault, element_integer, element_value, reading, tag_text
 from stereoreg_ros.dicom.header import SliceHeader
 from stereoreg_ros.dicom.multiframe import single_frame
@@ -61,7 +62,7 @@ def _read_stored(header: SliceHeader, dataset: pydicom.Dataset) -> NDArray[Any]:
         f"{tag_text('PixelData')} cannot be decoded: {len(data)} bytes in transfer syntax {name} (0002,0010), "
         "expected a whole image in one that can be decoded here",
     ):
-        stored = np.asarray(dataset.pixel_array)
+        stored = decoded(dataset) if uid.is_encapsulated else np.asarray(dataset.pixel_array)
     if stored.shape != (header.rows, header.columns):
         raise DicomError(
             file,
