@@ -44,8 +44,11 @@ def main() -> int:
             time.sleep(max(0.0, begun + 1e-9 * (at_ns - first_ns) - time.monotonic()))
             publishers[connection.topic].publish(message)
             if at_ns == first_ns:
-                # Before the first image comes, the receiver has to know that slices have poses, and has its pose.
+                # Before the first image comes, the receiver has to know that slices have poses, and has its pose. That
+                # may take seconds; those that follow keep their distance.
+                waits_since = time.monotonic()
                 publishers[connection.topic].wait_for_all_acked(Duration(seconds=DEADLINE_S))
+                begun += time.monotonic() - waits_since
         for publisher in publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=DEADLINE_S))
     node.destroy_node()
