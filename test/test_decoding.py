@@ -63,7 +63,7 @@ def test_values_are_those_that_pydicom_decodes():
 
 def test_an_image_over_which_the_decoder_hangs_is_refused_and_the_next_is_read():
     before = decoder_pid()
-    with pytest.raises(DicomError, match=r"Pixel Data .* cannot be decoded: .* the decoder took more than 2\.0 s"):
+    with pytest.raises(DicomError, match=r"Pixel Data .* cannot be decoded: .* the decoder took more than 1\.5 s"):
         read_slice(ENDLESS)
     assert_ends(before)
     assert decoder_pid() != before

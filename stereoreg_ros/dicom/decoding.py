@@ -37,7 +37,7 @@ _KEYWORDS: Final = (
 )
 # To start Python and find the decoders; then for an image. 512 x 512 pixels take some hundredths of a second.
 _START_S: Final = 30.0
-_LEAST_S: Final = 2.0
+_LEAST_S: Final = 1.5
 _S_PER_PIXEL: Final = 1e-6
 _LENGTH_BYTES: Final = 8
 
