@@ -27,7 +27,7 @@ def _crash() -> None:
 
 
 def _swell() -> None:
-    np.ones(2**26)
+    np.ones(2**25)
 
 
 def _ask() -> None:
