@@ -8,6 +8,7 @@ BENCH_ARGS ?=
 MINUTES ?= 60
 INPUTS ?= 10000
 FUZZ_ARGS ?=
+MATRIX_TESTS ?=
 
 SHELL := bash
 # Not -u: colcon's setup.bash reads variables that nobody has set.
@@ -47,7 +48,7 @@ help:
 	@echo 'make demo       simulated scanner and registration as two processes; SLICES=$(SLICES) DEMO_OUTPUT=$(DEMO_OUTPUT)'
 	@echo 'make test       all tests, in two processes; PYTEST_ARGS="-k word" to choose, in one'
 	@echo 'make colcon-test  the tests of the core as colcon runs them'
-	@echo 'make matrix     the most telling tests on other versions: Ubuntu 24.04, the newest, ROS 2 Kilted'
+	@echo 'make matrix     the most telling tests on other versions: Ubuntu 24.04, the newest, ROS 2 Kilted; MATRIX_TESTS=...'
 	@echo 'make docs       the documentation as a site: build/docs/index.html'
 	@echo 'make lint       style and types'
 	@echo 'make bench      measurements'
@@ -107,7 +108,7 @@ colcon-test: venv
 	.ci/colcon-test
 
 matrix: $(INSTALLED)
-	.ci/matrix/run
+	.ci/matrix/run $(MATRIX_TESTS)
 
 docs: $(INSTALLED)
 	rm -rf build/docs
