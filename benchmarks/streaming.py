@@ -32,6 +32,7 @@ from benchmarks.yardstick import Yardstick
 P50_Y, P99_Y = 8.0, 30.0
 RATE_HZ, FAST_HZ = 10.0, 30.0
 _SILENCE_S: Final = 10.0
+# Slices that are sent to a bare subscriber.
 _ALONE: Final = 100
 
 

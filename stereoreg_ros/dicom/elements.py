@@ -48,6 +48,7 @@ def element_value(file: Path, dataset: pydicom.Dataset, keyword: str) -> Any:
 
 
 def element_numbers(file: Path, dataset: pydicom.Dataset, keyword: str, count: int) -> list[float]:
+    """The element's finite numbers, so many; DicomError where it has others."""
     expected = "a finite number" if count == 1 else f"{count} finite numbers"
     value = element_value(file, dataset, keyword)
     if value is None:
@@ -62,6 +63,7 @@ def element_numbers(file: Path, dataset: pydicom.Dataset, keyword: str, count: i
 
 
 def element_integer(file: Path, dataset: pydicom.Dataset, keyword: str, low: int, high: int) -> int:
+    """The element's whole number, from low to high; DicomError where it has another."""
     expected = f"{low}" if low == high else f"a whole number from {low} to {high}"
     value = element_value(file, dataset, keyword)
     if value is None:
@@ -76,11 +78,13 @@ def element_integer(file: Path, dataset: pydicom.Dataset, keyword: str, low: int
 
 
 def tag_text(keyword: str) -> str:
+    """The element's name and tag, as errors call it."""
     tag = tag_for_keyword(keyword) or 0
     return f"{dictionary_description(tag)} ({tag >> 16:04X},{tag & 0xFFFF:04X})"
 
 
 def element_fault(file: Path, keyword: str, found: object, expected: str) -> DicomError:
+    """The error for an element that is missing (found: None) or not what is expected."""
     state = "is missing" if found is None else f"is {_shortened(repr(found))}"
     return DicomError(file, f"{tag_text(keyword)} {state}, expected {expected}")
 
