@@ -20,7 +20,7 @@ pytest.importorskip("rosbags", reason="rosbags is not there")
 
 from contract import STATUS_NAME
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 from ros_process import REPOSITORY, ROS_ENVIRONMENT, RosClient, node_process
 from rosbags.highlevel import AnyReader
 
@@ -116,7 +116,16 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
         log = tmp_path / "printed"
         with log.open("w") as output:
             printer = started("print_poses.py", stdout=output)
-        client.wait_for(lambda: client.node.count_subscribers("/pose") == 2, "the example that prints")
+
+        def printer_hears() -> bool:
+            # By what it prints: that this client has found it does not say that the node has. The target is refused, as
+            # it names no axes.
+            diagnostics.clear()
+            client.publish("/target", PointStamped())
+            client.wait_for(lambda: diagnostics, "the answer to a target")
+            return "register_node: target" in log.read_text()
+
+        client.wait_for(printer_hears, "the example that prints")
         player = started("play_bag.py", str(bag))
         try:
 
@@ -145,6 +154,7 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
                 if process.poll() is None:
                     process.kill()
                     process.wait()
+            print(f"--- output of print_poses.py\n{log.read_text()}---")
     found = {(one.header.stamp.sec, one.header.stamp.nanosec): pose_from_message(one) for one in poses}
     assert set(found) == accepted_stamps
     assert {stamp for stamp, outcome in outcomes().items() if outcome == "accepted"} == accepted_stamps
