@@ -191,16 +191,28 @@ class RosClient:
         self.wait_for(subscription.get_publisher_count, f"a publisher of {topic}")
         return messages
 
+    def announce(self, topic: str, message_type: type) -> Publisher:
+        """Become a publisher of a topic that somebody listens to."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(message_type, topic, _QUEUE)
+        self.wait_for(self._publishers[topic].get_subscription_count, f"a subscriber of {topic}")
+        return self._publishers[topic]
+
     def publish(self, topic: str, message: Any) -> None:
         """Publish, once somebody listens."""
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.create_publisher(type(message), topic, _QUEUE)
-        self.wait_for(self._publishers[topic].get_subscription_count, f"a subscriber of {topic}")
-        self._publishers[topic].publish(message)
+        self.announce(topic, type(message)).publish(message)
 
     def unpublish(self, topic: str) -> None:
         """Withdraw as publisher of a topic."""
         self.node.destroy_publisher(self._publishers.pop(topic))
+
+    def client_of(self, service_type: Any, service: str, deadline_s: float = DEADLINE_S) -> Any:
+        """The client of a service that is there, the same one for every call."""
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(service_type, service)
+        client = self._clients[service]
+        self.wait_for(client.service_is_ready, f"service {service}", deadline_s)
+        return client
 
     def call(
         self,
@@ -216,10 +228,7 @@ class RosClient:
         (https://github.com/ros2/rmw_fastrtps/issues/842), which happens to new clients under load. The call is
         therefore made once more where no response has come by then; again_after_s: None where it must not be.
         """
-        if service not in self._clients:
-            self._clients[service] = self.node.create_client(service_type, service)
-        client = self._clients[service]
-        self.wait_for(client.service_is_ready, f"service {service}", deadline_s)
+        client = self.client_of(service_type, service, deadline_s)
         end, calls = time.monotonic() + deadline_s, [client.call_async(request or service_type.Request())]
 
         def answered() -> list[Any]:

@@ -96,6 +96,9 @@ def test_an_image_waits_for_what_belongs_to_it_in_any_order(client):
     hu, slice_from_frame = rendered(4)
     with node_process("register_node", *arguments("/order", SCALE)):
         bench = SpacedBench(client, "/order", "/order/image")
+        # A source announces what its images bear before its images.
+        client.announce("/order/slice_pose", PoseStamped)
+        client.announce("/order/slice_spacing", Vector3Stamped)
         bench.warm_up(bench.diagnostics)
         stamp = bench.next_stamp()
         image = image_of(hu)
