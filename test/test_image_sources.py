@@ -51,6 +51,11 @@ def test_two_names_are_a_fault_at_once():
     assert sources.fault(0.0) == "/image is published by /player and /receiver at once, expected one source of slices"
 
 
+def test_a_second_one_whose_name_is_not_known_yet_is_a_fault():
+    sources = sources_in(Graph(("receiver", 1), ("_NODE_NAME_UNKNOWN_", 2)))
+    assert sources.fault(0.0).startswith("/image is published by /receiver and a node whose name is not known at once")
+
+
 def test_publishers_of_one_process_are_one_source():
     """As of one that offers slices reliably and best-effort."""
 
@@ -87,7 +92,7 @@ def test_while_two_nodes_publish_nothing_is_registered(topic, message_type):
             client.publish(f"{namespace}/slice_pose", PoseStamped())
         # It need not even have sent anything.
         publisher = other.node.create_publisher(message_type, f"{namespace}/{topic}", 10)
-        client.wait_for(lambda: "at once, expected one source" in process.output, "the warning")
+        client.wait_for(lambda: "/one_scanner and /other_scanner at once" in process.output, "the warning")
         if topic == "slice_pose":
             plane = PoseStamped()
             plane.header.stamp = bench.next_stamp()
@@ -101,8 +106,4 @@ def test_while_two_nodes_publish_nothing_is_registered(topic, message_type):
         assert of_stamp(bench.poses, stamp) is None
         if topic == "image":
             other.node.destroy_publisher(publisher)
-
-            def accepted() -> bool:
-                return values_of(bench.status(bench.send(image_of(hu))))["outcome"] == "accepted"
-
-            client.wait_for(accepted, "poses after the other has gone")
+            client.wait_for(lambda: bench.is_accepted(image_of(hu)), "poses after the other has gone")

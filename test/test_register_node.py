@@ -113,6 +113,10 @@ class Bench:
         assert status.level != DiagnosticStatus.ERROR, status.message
         return self.pose(stamp), values_of(status)
 
+    def is_accepted(self, image: Image) -> bool:
+        """Whether an image is accepted now."""
+        return values_of(self.status(self.send(image)))["outcome"] == "accepted"
+
     def refuse(self, image: Image, reason: str, sentence: str, **kwargs: Any) -> None:
         """Send an image that must be refused, and then a good one, before which no pose may come."""
         stamp = self.send(image, **kwargs)

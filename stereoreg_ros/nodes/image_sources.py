@@ -7,11 +7,14 @@ from typing import Final
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 # A process that was killed is counted among the publishers until its lease has run out: 20 s in Fast DDS by default.
 LEASE_S: Final = 30.0
 # Of the identifier of a publisher, so much is that of its process.
 _PROCESS_BYTES: Final = 12
+# What ROS calls a node of which only the topics are known: it has just come, or is none of ROS.
+_UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"
 
 
 class ImageSources:
@@ -41,7 +44,7 @@ class ImageSources:
             del seen_s[gone]
         for process in processes:
             seen_s.setdefault(process, now_s)
-        names = sorted({f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers})
+        names = sorted({_name_of(one) for one in publishers})
         if len(names) > 1:
             return f"{topic} is published by {' and '.join(names)} at once, expected one source of slices"
         both_since_s = sorted(seen_s.values())[1:2]
@@ -49,3 +52,9 @@ class ImageSources:
             count, name = len(processes), names[0]
             return f"{topic} is published by {count} nodes called {name} at once, expected one source of slices"
         return ""
+
+
+def _name_of(publisher: TopicEndpointInfo) -> str:
+    if publisher.node_name == _UNKNOWN:
+        return "a node whose name is not known"
+    return f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
