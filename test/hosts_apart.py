@@ -223,6 +223,9 @@ def test_the_host_of_register_node_is_cut_off(system):
     site.network.plug_in(REGISTERING)
     plugged_s = time.time()
     site.wait_for_statuses(taken)
+    told = [stamp for stamp, _ in site.statuses() if stamp >= taken[0].from_s]
+    assert len(told) == len(taken)
+    assert told == sorted(told)
     # Those that were published before the controller was in reach again it has missed, but for the newest.
     site.wait_for_poses(taken[-1:])
     came = [sent for sent in taken if site.pose_of(sent)]
