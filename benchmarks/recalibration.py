@@ -1,4 +1,6 @@
-"""`python -m benchmarks.recalibration`: the scale from rendered slices, right from the start and up to 10 % wrong."""
+"""`python -m benchmarks.recalibration`: the scale from rendered slices, right from the start and up to 10 % wrong, of
+frames that are exact, built to a tolerance, or of another size than their file says.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,8 @@ import math
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +18,7 @@ from tqdm import tqdm
 
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice
 from stereoreg_ros.calibration import Calibration, Sighting, calibrate, sighting_of
+from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 
@@ -22,16 +27,40 @@ CENTRE_NOISE_PX = 0.25
 _CHI_SQUARE_2_AT_1E5 = 23.0
 
 
-def sightings(rng: np.random.Generator, slices: int, most_false: int) -> list[Sighting]:
-    """Spots found in rendered slices of cube6, their centres shifted by CENTRE_NOISE_PX."""
-    frame, taken = load_frame("cube6"), []
-    for _ in range(slices):
-        scanner = ScannerSettings(shape=(320, 320), scale=TRUE, false_spots=int(rng.integers(0, most_false + 1)))
+class Kind(NamedTuple):
+    """What is tried: how many slices, with how many false spots at most, the spacing wrong by which share at most, of a
+    frame whose rods' ends are off by tolerance_mm, as is stated, and that is larger than its file says by a factor.
+
+    stated: whether the spacing comes with the slices, so that it is to be kept.
+    """
+
+    slices: int
+    most_false: int
+    wrong: float
+    tolerance_mm: float = 0.0
+    larger: float = 1.0
+    stated: bool = False
+
+
+def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelScale) -> list[Sighting]:
+    """Spots found in rendered slices of a frame, their centres shifted by CENTRE_NOISE_PX."""
+    taken = []
+    for _ in range(kind.slices):
+        scanner = ScannerSettings(shape=(320, 320), scale=TRUE, false_spots=int(rng.integers(0, kind.most_false + 1)))
         ct_slice: Slice = render_slice([PlacedFrame(frame, random_pose(rng, frame, scanner))], scanner, rng)
         seen = sighting_of(register_slice(ct_slice, frame), ct_slice.hu.size)
         shifted = seen.spots_px + CENTRE_NOISE_PX * rng.standard_normal(seen.spots_px.shape)
-        taken.append(Sighting(shifted, seen.covariances_px2, seen.pixels))
+        taken.append(Sighting(shifted, seen.covariances_px2, seen.pixels, stated=told if kind.stated else None))
     return taken
+
+
+def as_built(rng: np.random.Generator, frame: Frame, kind: Kind) -> Frame:
+    """The frame as it truly is."""
+    starts, ends = (
+        kind.larger * points + kind.tolerance_mm * rng.standard_normal(points.shape)
+        for points in (frame.starts, frame.ends)
+    )
+    return replace(frame, starts=starts, ends=ends)
 
 
 def main() -> int:
@@ -41,23 +70,35 @@ def main() -> int:
     parser.add_argument("--sequences", type=int, default=20, help="sequences of 43 slices (default 20)")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    frame, options = load_frame("cube6"), RegistrationOptions(spot_noise_px=CENTRE_NOISE_PX)
+    frame = load_frame("cube6")
     failed = False
-    print("slices  false  wrong by  trials  right  refused  worse  RMS/%   stated/%  NEES (2)  median/s  longest/s")
-    for slices, most_false, wrong, trials in (
-        (43, 0, 0.0, arguments.sequences),
-        (1, 0, 0.0, arguments.trials),
-        (10, 8, 0.0, arguments.trials // 4),
-        (1, 8, 0.1, arguments.trials),
-        (5, 8, 0.1, arguments.trials),
+    print(
+        "slices  false  wrong by  rods/mm  larger  spacing  trials  right  refused  worse  RMS/%   stated/%  NEES (2)  "
+        "median/s  longest/s"
+    )
+    for kind, trials in (
+        (Kind(43, 0, 0.0), arguments.sequences),
+        (Kind(1, 0, 0.0), arguments.trials),
+        (Kind(10, 8, 0.0), arguments.trials // 4),
+        (Kind(1, 8, 0.1), arguments.trials),
+        (Kind(5, 8, 0.1), arguments.trials),
+        (Kind(43, 0, 0.0, tolerance_mm=0.2), arguments.sequences),
+        (Kind(1, 0, 0.0, tolerance_mm=0.2), arguments.trials),
+        (Kind(10, 8, 0.0, tolerance_mm=0.2), arguments.trials // 4),
+        (Kind(5, 8, 0.1, tolerance_mm=0.2), arguments.trials // 4),
+        (Kind(10, 8, 0.0, tolerance_mm=0.2, stated=True), arguments.trials // 4),
+        (Kind(5, 8, 0.0, tolerance_mm=0.2, larger=1.03, stated=True), arguments.trials // 4),
     ):
-        rng = np.random.default_rng(slices + most_false)
+        options = RegistrationOptions(spot_noise_px=CENTRE_NOISE_PX, frame_tolerance_mm=kind.tolerance_mm)
+        rng = np.random.default_rng(kind.slices + kind.most_false)
         errors, stated, nees, times = [], [], [], []
         worse, reasons = 0, Counter[str]()
         for trial in tqdm(range(trials), disable=None, leave=False):
-            by = 1 + (rng.choice([-wrong, wrong], 2) if trial % 2 else rng.uniform(-wrong, wrong, 2))
+            by = 1 + (
+                rng.choice([-kind.wrong, kind.wrong], 2) if trial % 2 else rng.uniform(-kind.wrong, kind.wrong, 2)
+            )
             told = PixelScale(by[0] * TRUE.sx, by[1] * TRUE.sy)
-            taken = sightings(rng, slices, most_false)
+            taken = sightings(rng, as_built(rng, frame, kind), kind, told)
             start = time.perf_counter()
             found = calibrate(taken, frame, told, options)
             times.append(time.perf_counter() - start)
@@ -68,13 +109,16 @@ def main() -> int:
             nees.append(float(error @ np.linalg.solve(found.covariance, error)))
             errors.append(error / TRUE.sx)
             stated.append(np.array(found.standard_errors) / TRUE.sx)
-            worse += bool(wrong > 0 and np.abs(error).max() / TRUE.sx > np.abs(by - 1).max() + 1e-9)
+            worse += bool(kind.wrong > 0 and np.abs(error).max() / TRUE.sx > np.abs(by - 1).max() + 1e-9)
             worse += nees[-1] > _CHI_SQUARE_2_AT_1E5
         failed |= worse > 0
-        rms, claimed = (100 * math.sqrt(float(np.mean(np.square(part)))) for part in (errors, stated))
+        rms, claimed = (
+            100 * math.sqrt(float(np.mean(np.square(part)))) if part else math.nan for part in (errors, stated)
+        )
         print(
-            f"{slices:6d}  {most_false:5d}  {100 * wrong:6.0f} %  {trials:6d}  {len(errors):5d}  "
-            f"{sum(reasons.values()):7d}  {worse:5d}  {rms:5.3f}   {claimed:8.3f}  {np.mean(nees):8.2f}  "
+            f"{kind.slices:6d}  {kind.most_false:5d}  {100 * kind.wrong:6.0f} %  {kind.tolerance_mm:7.1f}  "
+            f"{kind.larger:6.2f}  {'stated' if kind.stated else 'typed':7s}  {trials:6d}  {len(errors):5d}  "
+            f"{sum(reasons.values()):7d}  {worse:5d}  {rms:5.3f}   {claimed:8.3f}  {np.mean(nees or [math.nan]):8.2f}  "
             f"{np.median(times):8.2f}  {max(times):9.2f}   {dict(reasons) or ''}",
             flush=True,
         )

@@ -20,8 +20,9 @@ from stereoreg_ros.registration import at_least, register_spots
 from stereoreg_ros.result import Refusal, Registration
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import calibrate_linear, calibrate_newton_raphson
-from stereoreg_ros.solvers.joint_calibration import JointScale, calibrate_jointly
-from stereoreg_ros.solvers.maximum_likelihood import refine
+from stereoreg_ros.solvers.joint_calibration import calibrate_jointly
+from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
+from stereoreg_ros.solvers.tolerant_calibration import TolerantScale, calibrate_tolerantly
 
 MIN_LINES = 5
 # A scale whose standard error is larger than this share of it is not a measurement worth having.
@@ -32,13 +33,19 @@ _EXPLAINED = 0.8
 _LEAST_FREEDOM = 4
 # Steps in which scales are tried, and with how many slices at most.
 _STEP, _SEARCHED = 0.05, 3
-# Half a step off, a spot at the frame's edge is off by a fortieth of the frame's radius; most are nearer.
+# Standard deviation of what is left of a scale's error, which is half a step at most. A spot at the frame's edge is off
+# by that share of the frame's radius.
 _OFF = _STEP / 4
 # False alarms with which a slice is looked at closer, log10: what it shows is then measured and matched anew.
 _LOOK_CLOSER = -1.0
 # Probability of a residual as large by the stated noise alone, below which it is not the noise.
 _IMPLAUSIBLE = 1e-6
 _ROUNDS = 4
+# Standard deviations by which the change of sx must differ from that of sy before the frame's size explains neither.
+_APART = 3.0
+_NOT_TOLD_APART = "Scale and size of the frame cannot be told apart from slices"
+# The largest that a limit of a registration can be.
+_ANY_MM = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +53,15 @@ class Sighting:
     """The spots of one slice, whatever was made of them.
 
     spots_px: (n, 2); covariances_px2: (n, 2, 2) of their centres; pixels: of the slice, None where not known;
-    scanner_from_slice: its plane.
+    scanner_from_slice: its plane; stated: the pixel scale that came with the slice, None where none did, and somebody
+    typed it in.
     """
 
     spots_px: Array
     covariances_px2: Array
     pixels: int | None = None
     scanner_from_slice: Pose | None = None
+    stated: PixelScale | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +69,17 @@ class Calibration:
     """An accepted scale. True as a condition.
 
     scale, previous_scale: mm/pixel; standard_errors: of (sx, sy) and, where it was measured, the shear, mm/pixel;
-    covariance: (2, 2) or (3, 3), mm^2/pixel^2; slices, rods: from how many slices, and how many spots in all;
-    residual_before_px, residual_after_px: RMS over these spots; poses: slice_from_frame of the slices used; message:
-    one sentence for an operator.
+    covariance: (2, 2) or (3, 3), mm^2/pixel^2; frame_errors: the part of standard_errors that the tolerance of the
+    frame's rods brings, which no further slice makes smaller; slices, rods: from how many slices, and how many spots in
+    all; residual_before_px, residual_after_px: RMS over these spots, with the frame as in its file; poses:
+    slice_from_frame of the slices used; message: what an operator has to know, in one line.
     """
 
     scale: PixelScale
     previous_scale: PixelScale
     standard_errors: tuple[float, ...]
     covariance: Array
+    frame_errors: tuple[float, ...]
     slices: int
     rods: int
     residual_before_px: float
@@ -90,9 +101,14 @@ class CalibrationRefusal:
         return False
 
 
-def sighting_of(result: Registration | Refusal, pixels: int | None = None, plane: Pose | None = None) -> Sighting:
-    """The spots of a registered or refused slice."""
-    return Sighting(result.spots_px, _covariances(result), pixels, plane)
+def sighting_of(
+    result: Registration | Refusal,
+    pixels: int | None = None,
+    plane: Pose | None = None,
+    stated: PixelScale | None = None,
+) -> Sighting:
+    """The spots of a registered or refused slice; see `Sighting`."""
+    return Sighting(result.spots_px, _covariances(result), pixels, plane, stated)
 
 
 def calibrate(
@@ -105,8 +121,11 @@ def calibrate(
 ) -> Calibration | CalibrationRefusal:
     """One pixel scale from slices that show the frame, by joint maximum likelihood with a pose for each.
 
-    scale: the configured one, mm/pixel; where it leaves slices unexplained, scales up to `calibration_max_change` off
-    are tried. progress: told the share of these that was, says whether to go on; where not, the calibration is refused.
+    scale: the one in use, mm/pixel; where it leaves slices unexplained, others are tried. What came with the slices
+    themselves (`Sighting.stated`) is known far better than what somebody typed in, and is changed by far less: see
+    `CalibrationOptions.calibration_max_change`. The rods are where `frame` has them within their tolerances, those of
+    the frame or `frame_tolerance_mm`; a frame of another size altogether looks like another scale. progress: told the
+    share of the scales that was tried, says whether to go on; where not, the calibration is refused.
     """
     options, calibration = options or RegistrationOptions(), calibration or CalibrationOptions()
     if not sightings:
@@ -130,14 +149,15 @@ def calibrate(
                 found = other
     if isinstance(found, str):
         return CalibrationRefusal(f"calibration refused: {found}")
-    return _judged(found, frame, scale, calibration)
+    return _judged(found, scale, calibration)
 
 
 @dataclass(frozen=True, eq=False)
 class _Explained:
     """Slices that one scale explains."""
 
-    joint: JointScale
+    frame: Frame
+    joint: TolerantScale
     matched: list[Registration]
     sightings: list[Sighting]
 
@@ -145,6 +165,35 @@ class _Explained:
     def rods(self) -> int:
         """Spots of rods in all slices."""
         return sum(len(one.matches) for one in self.matched)
+
+    @property
+    def tolerances_mm(self) -> Array:
+        """Of the rods (n,)."""
+        return self.frame.tolerances_or(self.matched[0].options.frame_tolerance_mm)
+
+    @property
+    def covariance(self) -> Array:
+        """Of the scale: where the residuals are larger than stated, so are the errors."""
+        return self._excess * self.joint.covariance
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """Standard errors of the scale, mm/pixel."""
+        return _roots(self.covariance)
+
+    @property
+    def frame_errors(self) -> tuple[float, ...]:
+        """The part of these that the frame's tolerance brings, mm/pixel."""
+        return _roots(self._excess * self.joint.frame_covariance)
+
+    @property
+    def stated(self) -> PixelScale | None:
+        """The scale that came with the slices, with the last one that has any."""
+        return next((one.stated for one in reversed(self.sightings) if one.stated is not None), None)
+
+    @property
+    def _excess(self) -> float:
+        return max(self.joint.chi_square / self.joint.degrees_of_freedom, 1.0)
 
 
 def _explained(
@@ -159,8 +208,7 @@ def _explained(
     if not matched:
         return (
             f"in none of {len(sightings)} slices the rods could be identified, with the pixel spacing "
-            f"({start.sx:.4f}, {start.sy:.4f}) mm/pixel or one up to "
-            f"{100 * calibration.calibration_max_change:.3g} % off"
+            f"({start.sx:.4f}, {start.sy:.4f}) mm/pixel or one up to {100 * _reach(calibration):.3g} % off"
         )
     most = max(len(one.matches) for _, one in matched)
     if most < MIN_LINES:
@@ -178,7 +226,7 @@ def _explained(
             break
     registrations = [one for _, one in used]
     joint = _joint(frame, registrations, calibration.calibrate_shear)
-    return _Explained(joint, registrations, [sighting for sighting, _ in used])
+    return _Explained(frame, joint, registrations, [sighting for sighting, _ in used])
 
 
 def _matched(
@@ -192,7 +240,9 @@ def _matched(
 def match_sighting(
     sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
 ) -> Registration | Refusal:
-    """Register the frame from the spots of a slice with this scale, mm/pixel."""
+    """Register the frame from the spots of a slice with this scale, mm/pixel, however weakly its pose is known."""
+    # Which spot is which rod is all that is asked.
+    options = replace(options, max_position_std_mm=_ANY_MM, max_target_error_mm=_ANY_MM)
     area_mm2 = sighting.pixels * scale.sx * scale.sy if sighting.pixels else None
     plane, covariances = sighting.scanner_from_slice, sighting.covariances_px2
     return register_spots(sighting.spots_px, frame, scale, options, plane, area_mm2, covariances_px2=covariances)
@@ -228,13 +278,13 @@ def _search(
     require. The scales nearest to the configured one come first.
     """
     waiting = list(sightings[-_SEARCHED:])
-    factors = _factors(calibration.calibration_max_change)
+    factors = _factors(_reach(calibration))
     ends = np.concatenate([frame.starts, frame.ends])
     off_mm = _OFF * float(np.linalg.norm(np.ptp(ends, axis=0))) / 2
     loose = replace(
         options,
         max_log10_false_alarms=max(_LOOK_CLOSER, options.max_log10_false_alarms),
-        max_position_std_mm=1000.0,
+        scale_tolerance=max(_OFF, options.scale_tolerance),
         min_inliers=max(MIN_LINES, options.min_inliers),
     )
     tried = len(factors) * max(len(waiting), 1)
@@ -258,6 +308,11 @@ def _search(
             return
 
 
+def _reach(calibration: CalibrationOptions) -> float:
+    """How far off scales are tried, as a share: farther than what came with slices may change, to say what is found."""
+    return calibration.largest_change(came_with_slices=False)
+
+
 def _factors(max_change: float) -> list[tuple[float, float]]:
     """Factors of (sx, sy) in steps within the allowed change, the smallest change first."""
     count = math.ceil(max_change / _STEP - 1e-9)
@@ -266,7 +321,7 @@ def _factors(max_change: float) -> list[tuple[float, float]]:
     return [(1 + x, 1 + y) for x, y in sorted(both, key=lambda pair: (max(map(abs, pair)), sum(map(abs, pair)), pair))]
 
 
-def _joint(frame: Frame, matched: Sequence[Registration], with_shear: bool) -> JointScale:
+def _joint(frame: Frame, matched: Sequence[Registration], with_shear: bool) -> TolerantScale:
     """The scale from slices whose rods are known, from the Newton-Raphson solution of one (Maurin 2009, section 3)."""
     richest = max(matched, key=lambda one: len(one.matches))
     first = calibrate_newton_raphson(frame, *_couples(richest))
@@ -274,7 +329,19 @@ def _joint(frame: Frame, matched: Sequence[Registration], with_shear: bool) -> J
     change = max(abs(first.scale.sx / start.sx - 1), abs(first.scale.sy / start.sy - 1))
     if first.converged and change < 2 * _STEP:
         start = first.scale
-    return calibrate_jointly(frame, *_posed(frame, matched), start, with_shear)
+    rotations, translations, spots_px, used, covariances = _posed(frame, matched)
+    exact = calibrate_jointly(frame, rotations, translations, spots_px, used, covariances, start, with_shear)
+    return calibrate_tolerantly(
+        frame,
+        frame.tolerances_or(richest.options.frame_tolerance_mm),
+        exact.rotations,
+        exact.translations,
+        spots_px,
+        used,
+        covariances,
+        exact.scale,
+        3 if with_shear else 2,
+    )
 
 
 def _posed(frame: Frame, matched: Sequence[Registration]) -> tuple[Array, Array, Array, NDArray[np.bool_], Array]:
@@ -319,65 +386,139 @@ def _degenerate(frame: Frame, matched: Sequence[Registration]) -> str:
 
 
 def _judged(
-    found: _Explained, frame: Frame, previous: PixelScale, calibration: CalibrationOptions
+    found: _Explained, previous: PixelScale, calibration: CalibrationOptions
 ) -> Calibration | CalibrationRefusal:
-    joint, matched = found.joint, found.matched
-    scale = joint.scale
-    for name, new, old in (("sx", scale.sx, previous.sx), ("sy", scale.sy, previous.sy)):
-        if abs(new / old - 1) > calibration.calibration_max_change:
-            return CalibrationRefusal(
-                f"calibration refused: {name} would change from {old:.4f} to {new:.4f} mm/pixel, "
-                f"more than {100 * calibration.calibration_max_change:.3g} %"
-            )
-    if not joint.converged:
-        return CalibrationRefusal("calibration refused: the joint solution did not converge")
-    if joint.degrees_of_freedom < _LEAST_FREEDOM:
+    kept = _refined(found, previous)
+    fault = _untrusted(found, previous, kept)
+    if fault:
+        return CalibrationRefusal(f"calibration refused: {fault}")
+    scale, errors, stated = found.joint.scale, found.errors, found.stated
+    reference = stated or previous
+    measured = f"({scale.sx:.4f} +- {errors[0]:.4f}, {scale.sy:.4f} +- {errors[1]:.4f}) mm/pixel"
+    size, of_frame = _other_size(reference, scale, errors), _of_frame(found)
+    limit = calibration.largest_change(came_with_slices=stated is not None)
+    change = max(abs(scale.sx / reference.sx - 1), abs(scale.sy / reference.sy - 1))
+    if change > limit:
+        origin = "came with the slices" if stated is not None else "is in use"
         return CalibrationRefusal(
-            f"calibration refused: {found.rods} rods in {len(matched)} slice leave too little to check the scale by, "
-            "another slice or another rod is needed"
+            f"calibration refused: scanner, or frame file? The pixel spacing that {origin} is ({reference.sx:.4f}, "
+            f"{reference.sy:.4f}) mm/pixel, measured is {measured}: {100 * change:.1f} % off, more than "
+            f"{100 * limit:.3g} %; if the first is right, the frame {size}. {_NOT_TOLD_APART}, and {of_frame}; measure "
+            "the frame, or set calibration_max_change to allow such a change"
         )
-    _, _, spots_px, used, covariances = _posed(frame, matched)
-    after = math.sqrt(float((joint.residuals_px**2).sum()) / found.rods)
-    if float(gammaincc(joint.degrees_of_freedom / 2, joint.chi_square / 2)) < _IMPLAUSIBLE:
-        return CalibrationRefusal(
-            f"calibration refused: the residual of {after:.3f} pixel RMS cannot come from the stated spot noise of "
-            f"{matched[0].options.spot_noise_px:g} pixel"
-        )
-    # Where the residuals are larger than stated, so are the errors.
-    covariance = joint.covariance * max(joint.chi_square / joint.degrees_of_freedom, 1.0)
-    errors = tuple(float(error) for error in np.sqrt(np.diag(covariance)))
-    for name, new, error in (("sx", scale.sx, errors[0]), ("sy", scale.sy, errors[1])):
-        if not error <= MAX_RELATIVE_ERROR * new:
-            return CalibrationRefusal(
-                f"calibration refused: {name} = {new:.4f} mm/pixel has a standard error of {error:.4f} mm/pixel, more "
-                f"than {100 * MAX_RELATIVE_ERROR:.3g} %"
-            )
-    before = _residual_rms_px(frame, joint, spots_px, used, covariances, previous)
-    if after > before + 1e-6:
-        return CalibrationRefusal(
-            f"calibration refused: the residual would grow from {before:.3f} to {after:.3f} pixel RMS"
-        )
-    slices = len(matched)
+    slices = len(found.matched)
     shear = f", shear {scale.shear:.4f} +- {errors[2]:.4f}" if len(errors) > 2 else ""
+    before, after = _rms_px(found, kept, previous), _rms_px(found, _refined(found, scale), scale)
     message = (
-        f"pixel spacing changed from ({previous.sx:.4f}, {previous.sy:.4f}) to ({scale.sx:.4f} +- {errors[0]:.4f}, "
-        f"{scale.sy:.4f} +- {errors[1]:.4f}) mm/pixel{shear} from {slices} slice{'s' if slices > 1 else ''} with "
-        f"{found.rods} rods; residual {before:.3f} pixel before, {after:.3f} pixel after"
+        f"pixel spacing changed from ({previous.sx:.4f}, {previous.sy:.4f}) to {measured}{shear} from {slices} "
+        f"slice{'s' if slices > 1 else ''} with {found.rods} rods; residual {before:.3f} pixel before, {after:.3f} "
+        f"pixel after; {of_frame}. {_NOT_TOLD_APART}: if ({reference.sx:.4f}, {reference.sy:.4f}) is right, the frame "
+        f"{size}"
     )
+    joint = found.joint
     poses = tuple(Pose(nearest_rotation(r), t) for r, t in zip(joint.rotations, joint.translations, strict=True))
-    return Calibration(scale, previous, errors, covariance, slices, found.rods, before, after, poses, message)
+    return Calibration(
+        scale,
+        previous,
+        errors,
+        found.covariance,
+        found.frame_errors,
+        slices,
+        found.rods,
+        before,
+        after,
+        poses,
+        message,
+    )
 
 
-def _residual_rms_px(
-    frame: Frame,
-    joint: JointScale,
-    spots_px: Array,
-    used: NDArray[np.bool_],
-    covariances: Array,
-    scale: PixelScale,
-) -> float:
-    """Of the same spots with another scale, the poses being fitted to it."""
+def _untrusted(found: _Explained, previous: PixelScale, kept: Refined) -> str:
+    """Why what was found cannot be trusted, or nothing. kept: the poses with the previous scale."""
+    joint, scale, options = found.joint, found.joint.scale, found.matched[0].options
+    if not joint.converged:
+        return "the joint solution did not converge"
+    if joint.degrees_of_freedom < _LEAST_FREEDOM:
+        return (
+            f"{found.rods} rods in {len(found.matched)} slice leave too little to check the scale by, another slice or "
+            "another rod is needed"
+        )
+    if float(gammaincc(joint.degrees_of_freedom / 2, joint.chi_square / 2)) < _IMPLAUSIBLE:
+        rms = math.sqrt(float((joint.residuals_px**2).sum()) / found.rods)
+        return (
+            f"the residual of {rms:.3f} pixel RMS cannot come from the stated spot noise of {options.spot_noise_px:g} "
+            f"pixel and rod ends that are known to {_tolerance(found)}"
+        )
+    for name, new, error in (("sx", scale.sx, found.errors[0]), ("sy", scale.sy, found.errors[1])):
+        if not error <= MAX_RELATIVE_ERROR * new:
+            return (
+                f"{name} = {new:.4f} mm/pixel has a standard error of {error:.4f} mm/pixel, more than "
+                f"{100 * MAX_RELATIVE_ERROR:.3g} %"
+            )
+    _, _, spots_px, used, covariances = _posed(found.frame, found.matched)
+    before = calibrate_tolerantly(
+        found.frame,
+        found.tolerances_mm,
+        kept.rotations,
+        kept.translations,
+        spots_px,
+        used,
+        covariances,
+        previous,
+        measured=0,
+    ).chi_square
+    if joint.chi_square > before + 1e-6:
+        return (
+            f"the slices fit ({previous.sx:.4f}, {previous.sy:.4f}) mm/pixel with a chi-square of {before:.1f}, better "
+            f"than ({scale.sx:.4f}, {scale.sy:.4f}) mm/pixel with {joint.chi_square:.1f}"
+        )
+    return ""
+
+
+def _other_size(stated: PixelScale, measured: PixelScale, errors: Sequence[float]) -> str:
+    """What the frame's size would have to be for the stated scale to be right: a larger frame has more pixels."""
+    by_x, by_y = 100 * (stated.sx / measured.sx - 1), 100 * (stated.sy / measured.sy - 1)
+    apart = math.hypot(100 * errors[0] / measured.sx, 100 * errors[1] / measured.sy)
+    if abs(by_x - by_y) <= _APART * apart + 0.05:
+        return f"would have to be {_larger(0.5 * (by_x + by_y))} than its file says"
+    return (
+        f"would have to be {_larger(by_x)} along the rows and {_larger(by_y)} along the columns than its file says, "
+        "which no other size of it is"
+    )
+
+
+def _larger(percent: float) -> str:
+    return f"{abs(percent):.1f} % {'smaller' if percent < 0 else 'larger'}"
+
+
+def _of_frame(found: _Explained) -> str:
+    """What the frame's tolerance does to the standard errors."""
+    by_x, by_y = found.frame_errors[:2]
+    if not found.tolerances_mm.any():
+        return "the frame is taken to be exact"
+    return f"rod ends known to {_tolerance(found)} contribute {by_x:.4f} and {by_y:.4f} to the errors"
+
+
+def _tolerance(found: _Explained) -> str:
+    """The tolerance of the rods, the least and the largest where they differ."""
+    least, most = float(found.tolerances_mm.min()), float(found.tolerances_mm.max())
+    return f"{most:g} mm" if least == most else f"{least:g} to {most:g} mm"
+
+
+def _roots(covariance: Array) -> tuple[float, ...]:
+    """Standard deviations."""
+    return tuple(float(error) for error in np.sqrt(np.diag(covariance)))
+
+
+def _refined(found: _Explained, scale: PixelScale) -> Refined:
+    """The poses fitted to a scale, with the rods where the frame's file has them."""
+    _, _, spots_px, used, covariances = _posed(found.frame, found.matched)
     whitening = np.linalg.inv(np.linalg.cholesky(covariances)) @ scale.inverse_matrix
-    fitted = refine(frame, joint.rotations, joint.translations, scale.to_mm(spots_px), used, whitening)
+    joint = found.joint
+    return refine(found.frame, joint.rotations, joint.translations, scale.to_mm(spots_px), used, whitening)
+
+
+def _rms_px(found: _Explained, fitted: Refined, scale: PixelScale) -> float:
+    """RMS of the distances between the rods' spots and their predictions, pixel."""
+    _, _, spots_px, used, _ = _posed(found.frame, found.matched)
     residual = np.where(used[..., None], scale.to_px(fitted.cuts.points_mm) - spots_px, 0.0)
-    return math.sqrt(float((residual**2).sum()) / int(used.sum()))
+    return math.sqrt(float((residual**2).sum()) / found.rods)

@@ -29,7 +29,7 @@ class SliceScale:
     """The scale from one slice alone.
 
     name: of the slice; rods: how many were identified; linear, newton_raphson: mm/pixel; standard_errors: of (sx, sy),
-    mm/pixel, for the stated spot noise.
+    mm/pixel, for the stated spot noise alone: what the frame is off by is the same in every slice.
     """
 
     name: str
@@ -58,7 +58,10 @@ def scale_of_series(
     calibration: CalibrationOptions,
     progress: Callable[[float], bool] | None = None,
 ) -> SeriesScale:
-    """Measure the scale from named slices of one spacing; ValueError where they have several, or there is none."""
+    """Measure the scale from named slices of one spacing, which came with them as files say it.
+
+    Raises ValueError where they have several spacings, or there is no slice.
+    """
     named: list[tuple[str, Sighting]] = []
     given: PixelScale | None = None
     for name, ct_slice in slices:
@@ -70,7 +73,8 @@ def scale_of_series(
         given = ct_slice.scale
         result = register_slice(ct_slice, frame, options)
         if len(result.spots_px) >= MIN_LINES:
-            named.append((name, sighting_of(result, ct_slice.hu.size, ct_slice.scanner_from_slice)))
+            plane, stated = ct_slice.scanner_from_slice, ct_slice.scale
+            named.append((name, sighting_of(result, ct_slice.hu.size, plane, stated)))
     if given is None:
         raise ValueError("there is no slice to calibrate from")
     outcome = calibrate([sighting for _, sighting in named], frame, given, options, calibration, progress)

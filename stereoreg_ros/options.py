@@ -13,6 +13,9 @@ AUTO: Final = "auto"
 MATCHERS: Final = ("three_line", "maurin2009")
 # No point that matters is farther from the frame; one that is was told in other units.
 _FARTHEST_MM: Final = 10_000.0
+# How far a pixel spacing may be off, as a share: what a scanner states with its slices, and what somebody typed in.
+_STATED_CHANGE: Final = 0.005
+_TYPED_CHANGE: Final = 0.15
 
 
 def _option(
@@ -44,6 +47,13 @@ class RegistrationOptions:
         0.001,
         10.0,
     )
+    frame_tolerance_mm: float = _option(
+        0.2,
+        "standard deviation per axis of the ends of rods whose tolerance the frame file does not state, mm",
+        0.0,
+        10.0,
+    )
+    scale_tolerance: float = _option(0.002, "standard deviation of the pixel spacing, as a fraction of it", 0.0, 0.1)
     slice_thickness_mm: float = _option(
         0.0, "thickness of the slice, mm: a leaning rod's spot is as long as it has to be; 0: not known", 0.0, 50.0
     )
@@ -65,7 +75,7 @@ class RegistrationOptions:
         (0.0, 0.0, 0.0), "the point whose error counts, such as the needle's tip: x, y, z in the frame's axes, mm"
     )
     max_target_error_mm: float = _option(
-        1000.0, "largest radius of the ball that holds 95 % of the errors at the target, mm", 0.001, 1000.0
+        3.0, "largest radius of the ball that holds 95 % of the errors at the target, mm", 0.001, 1000.0
     )
 
     def __post_init__(self) -> None:
@@ -97,8 +107,13 @@ class CalibrationOptions:
 
     calibration_slices: int = _option(10, "how many of the last slices recalibration uses", 1, 200)
     calibrate_shear: bool = _option(False, "whether recalibration measures the shear of the pixel grid too")
-    calibration_max_change: float = _option(
-        0.15, "largest change of the pixel spacing that recalibration may make, as a share of it", 0.001, 0.5
+    calibration_max_change: float | str = _option(
+        AUTO,
+        "largest change of the pixel spacing that recalibration may make, as a share of it; 'auto': "
+        f"{_STATED_CHANGE:g} where the spacing came with the slices, {_TYPED_CHANGE:g} where it was typed in",
+        0.001,
+        0.5,
+        AUTO,
     )
 
     def __post_init__(self) -> None:
@@ -108,6 +123,12 @@ class CalibrationOptions:
         if not isinstance(self.calibrate_shear, bool):
             raise ValueError(f"calibrate_shear is {self.calibrate_shear!r}, expected true or false")
         object.__setattr__(self, "calibration_slices", int(self.calibration_slices))
+
+    def largest_change(self, came_with_slices: bool) -> float:
+        """Largest change of the pixel spacing, as a share of it: as was set, or by where the spacing came from."""
+        if isinstance(self.calibration_max_change, str):
+            return _STATED_CHANGE if came_with_slices else _TYPED_CHANGE
+        return self.calibration_max_change
 
 
 def _checked_point(name: str, value: Any) -> tuple[float, float, float]:

@@ -8,35 +8,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.special import gammaincc
+from numpy.typing import ArrayLike, NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_from_quaternion
-from stereoreg_ros.geometry.projection import point_line_distances, project
+from stereoreg_ros.geometry.projection import Cuts, cut_jacobian, point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.judgement import (
+    DEGENERATE_ROTATION_DEG,
+    WEAK_POSITION_MM,
+    WEAK_ROTATION_DEG,
+    Verdict,
+    check_count,
+    check_orientation,
+    contradicted_orientation,
+    judge,
+    second_frame,
+)
 from stereoreg_ros.matching import maurin2009, three_line
-from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.consensus import decades_apart, score
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.near import match_near
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.spots import Spots, Streaks
+from stereoreg_ros.matching.spots import Spots, Streaks, whitening_of
+from stereoreg_ros.matching.three_line import SearchGivenUpError, find_better
+from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.options import RegistrationOptions
-from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
+from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
 from stereoreg_ros.spots import FoundSpots, find_spots
-from stereoreg_ros.uncertainty import checked_scale_covariance, in_scanner_axes, scale_sensitivity
+from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, in_scanner_axes
 
-MAX_SPOTS = 300
 _MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
-# Rotation (standard deviation about the weakest axis) beyond which a pose counts as not determined.
-_DEGENERATE_ROTATION_DEG = 10.0
-# Probabilities of a residual as large by the stated noise alone: less than these, and it is not the noise.
-_IMPLAUSIBLE, _DOUBTFUL = 1e-6, 1e-3
-# Standard deviations beyond which a pose is accepted with a caution: four of them are 2 mm and 3 degrees.
-_WEAK_POSITION_MM, _WEAK_ROTATION_DEG = 0.5, 0.75
+# An explanation that chance brings more often (log10) speaks against no other.
+_LOG10_RIVAL = -3.0
+# A second frame of the same kind is looked for with so many rods less than the first one shows.
+_FEWER_RODS = 2
 
 
 def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:
@@ -49,7 +59,9 @@ def preparation(frame: Frame, scale: PixelScale, options: RegistrationOptions | 
     """The same in small steps, for those who have other things to do; what most slices need comes first."""
     options = options or RegistrationOptions()
     if options.matcher == "three_line":
-        yield from three_line.preparation(frame, _noise_mm(scale, options.spot_noise_px), options)
+        noise_mm = options.spot_noise_px * max(scale.sx, scale.sy)
+        extent_mm = _tolerances(frame, scale, options, None).extent_mm
+        yield from three_line.preparation(frame, math.hypot(noise_mm, extent_mm), options)
 
 
 def register_slice(
@@ -65,8 +77,8 @@ def register_slice(
     """
     options = options or RegistrationOptions()
     known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    found = find_spots(ct_slice, options)
-    return _register_found(found, ct_slice, frame, options, previous, known)
+    seen = _seen(find_spots(ct_slice, options), ct_slice, options, known)
+    return _register(seen, frame, options, previous)
 
 
 def register_frames(
@@ -78,43 +90,72 @@ def register_frames(
 ) -> list[Registration | Refusal]:
     """Register several frames from one slice, one result for each, in their order.
 
-    The spots are found once. Those that an accepted frame has taken are not offered to the next; to a frame, another
-    one's spots are false spots. `Match.spot` counts in the spots of that frame's own result. previous: one a frame;
-    that and scale_covariance: see `register_spots`.
+    The spots are found once, and each frame is sought among all of them. Where two accepted frames lay claim to a spot,
+    the one that chance would bring less often keeps it, and the other one is sought again among the rest: the result
+    does not depend on the frames' order. `Match.spot` counts in the spots of that frame's own result. previous: one a
+    frame; that and scale_covariance: see `register_spots`.
     """
     options = options or RegistrationOptions()
     known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    found = find_spots(ct_slice, options)
-    results: list[Registration | Refusal] = []
-    for frame, before in zip(frames, previous or [None] * len(frames), strict=True):
-        result = _register_found(found, ct_slice, frame, options, before, known)
-        if result:
-            found = found.take(np.delete(np.arange(len(found)), [match.spot for match in result.matches]))
-        results.append(result)
-    return results
+    whole = _seen(find_spots(ct_slice, options), ct_slice, options, known)
+    before = list(previous or [None] * len(frames))
+    if len(before) != len(frames):
+        raise ValueError(f"previous has {len(before)} poses, expected one for each of {len(frames)} frames")
+    offered = [np.arange(len(whole.spots_px)) for _ in frames]
+    results = [_register(whole, frame, options, guess) for frame, guess in zip(frames, before, strict=True)]
+    while True:
+        claims = {
+            row: set(offered[row][[match.spot for match in result.matches]].tolist())
+            for row, result in enumerate(results)
+            if result
+        }
+        # The surest first; each takes what is left by those before.
+        surest = sorted(claims, key=lambda row: (results[row].estimate.log10_false_alarms, row))  # type: ignore[union-attr]
+        kept: set[int] = set()
+        loser = None
+        for row in surest:
+            if claims[row] & kept:
+                loser = row
+                break
+            kept |= claims[row]
+        if loser is None:
+            return results
+        offered[loser] = np.array([spot for spot in offered[loser] if spot not in kept], dtype=np.intp)
+        results[loser] = _register(whole.only(offered[loser]), frames[loser], options, before[loser])
 
 
-def _register_found(
-    found: FoundSpots,
-    ct_slice: Slice,
-    frame: Frame,
-    options: RegistrationOptions,
-    previous: Pose | None = None,
-    scale_covariance: Array | None = None,
-) -> Registration | Refusal:
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a slice shows: n spots, and what is known of them.
+
+    spots_px: (n, 2); covariances_px2: (n, 2, 2) of their centres, zero where not known; streaks: their lengths, None
+    where not known; area_mm2: over which they could have been found, None where not known; scale_covariance: see
+    `register_spots`.
+    """
+
+    spots_px: Array
+    covariances_px2: Array
+    streaks: Streaks | None
+    scale: PixelScale
+    scanner_from_slice: Pose
+    area_mm2: float | None
+    scale_covariance: Array | None
+
+    def only(self, rows: NDArray[np.intp]) -> _Seen:
+        """Some of the spots."""
+        streaks = None if self.streaks is None else self.streaks.only(rows)
+        return replace(self, spots_px=self.spots_px[rows], covariances_px2=self.covariances_px2[rows], streaks=streaks)
+
+
+def _seen(found: FoundSpots, ct_slice: Slice, options: RegistrationOptions, scale_covariance: Array | None) -> _Seen:
     scale = ct_slice.scale
-    area_mm2 = ct_slice.hu.size * scale.sx * scale.sy
-    streaks = _streaks(found, scale, options.slice_thickness_mm) if options.slice_thickness_mm > 0 else None
-    return _register(
+    return _Seen(
         found.centres_px,
         found.covariances_px2,
-        streaks,
-        frame,
+        _streaks(found, scale, options.slice_thickness_mm) if options.slice_thickness_mm > 0 else None,
         scale,
-        options,
         ct_slice.scanner_from_slice,
-        area_mm2,
-        previous,
+        ct_slice.hu.size * scale.sx * scale.sy,
         scale_covariance,
     )
 
@@ -153,111 +194,85 @@ def register_spots(
         raise ValueError("spots_px must be finite")
     covariances_px2 = _checked(covariances_px2, len(spots_px))
     known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    return _register(
-        spots_px, covariances_px2, None, frame, scale, options, scanner_from_slice, slice_area_mm2, previous, known
-    )
+    seen = _Seen(spots_px, covariances_px2, None, scale, scanner_from_slice, slice_area_mm2, known)
+    return _register(seen, frame, options, previous)
 
 
-def _register(
-    spots_px: Array,
-    covariances_px2: Array,
-    streaks: Streaks | None,
-    frame: Frame,
-    scale: PixelScale,
-    options: RegistrationOptions,
-    scanner_from_slice: Pose,
-    slice_area_mm2: float | None,
-    previous: Pose | None,
-    scale_covariance: Array | None,
-) -> Registration | Refusal:
-    """Match, judge, accept or refuse; see `register_spots`."""
+def _register(seen: _Seen, frame: Frame, options: RegistrationOptions, previous: Pose | None) -> Registration | Refusal:
+    """Match, estimate, judge; see `register_spots`."""
 
-    asked = options
+    def refusal(verdict: Verdict, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
+        assert verdict.reason is not None
+        return Refusal(
+            frame, seen.scale, seen.spots_px, verdict.reason, verdict.message, estimates, seen.covariances_px2, options
+        )
 
-    def refuse(reason: Reason, message: str, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
-        return Refusal(frame, scale, spots_px, reason, message, estimates, covariances_px2, asked)
-
-    count = len(spots_px)
-    if count < options.min_inliers:
-        return refuse("too_few_spots", f"{count} spots found, at least {options.min_inliers} are needed")
-    if count > MAX_SPOTS:
-        return refuse("no_consensus", f"{count} spots found, more than the {MAX_SPOTS} that are searched")
-
-    weighted_px2 = at_least(covariances_px2, options.spot_noise_px)
-    covariances_mm2 = scale.matrix @ weighted_px2 @ scale.matrix.T
-    spots = Spots.of(scale.to_mm(spots_px), covariances_mm2, slice_area_mm2, streaks)
-    nominal = scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
+    unfit = check_orientation(frame, options) or check_count(len(seen.spots_px), options)
+    if unfit is not None:
+        return refusal(unfit)
+    scale = seen.scale
+    covariances_mm2 = scale.matrix @ at_least(seen.covariances_px2, options.spot_noise_px) @ scale.matrix.T
+    tolerances = _tolerances(frame, scale, options, seen.scale_covariance)
+    spots = Spots.of(scale.to_mm(seen.spots_px), covariances_mm2, seen.area_mm2, tolerances, seen.streaks)
+    nominal = seen.scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     prior = Prior(nominal, math.radians(options.max_rotation_deg))
-    found = None
+    allowed, found = options, None
     if previous is not None and options.matcher == "three_line":
         # Each of the two searches gets half of the false alarms that are allowed.
-        options = replace(options, max_log10_false_alarms=options.max_log10_false_alarms - math.log10(2))
-        found = match_near(spots, frame, prior, options, scanner_from_slice.inverse() @ previous)
+        allowed = replace(options, max_log10_false_alarms=options.max_log10_false_alarms - math.log10(2))
+        found = match_near(spots, frame, prior, allowed, seen.scanner_from_slice.inverse() @ previous)
+    is_near = found is not None
     if found is None:
-        found = _MATCHERS[options.matcher](spots, frame, prior, options)
-    # How weakly a pose is determined matters of the best one: others are told only to say what they are.
-    estimates = tuple(
-        _estimate(h, rank == 0, spots_px, weighted_px2, frame, scale, scanner_from_slice, scale_covariance)
-        for rank, h in enumerate(found.hypotheses)
+        found = _MATCHERS[options.matcher](spots, frame, prior, allowed)
+    # How weakly a pose is determined matters of the best one: the others are only listed.
+    estimates = tuple(_estimate(one, rank == 0, spots, frame, seen) for rank, one in enumerate(found.hypotheses))
+    verdict = judge(
+        found,
+        estimates,
+        frame,
+        len(seen.spots_px),
+        allowed,
+        lambda: _rivals(found.hypotheses[0], spots, frame, prior, allowed, is_near),
     )
-    if found.given_up:
-        return refuse("no_consensus", f"the search among {count} spots was {found.given_up}", estimates)
-    if not estimates:
-        return refuse("no_consensus", _describe_nothing(found, len(frame), count, options))
-    best = estimates[0]
-    if best.log10_false_alarms > options.max_log10_false_alarms:
-        return refuse(
+    if verdict.reason is not None:
+        return refusal(verdict, estimates)
+    return Registration(frame, scale, options, seen.spots_px, estimates[0], verdict.message, seen.covariances_px2)
+
+
+def _rivals(
+    best: Hypothesis, spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions, is_near: bool
+) -> Verdict | None:
+    """What else the slice shows that speaks against the best explanation within the prior.
+
+    is_near: whether it is where the frame was before; then another frame of the same kind may be elsewhere.
+    """
+    try:
+        if prior.max_rotation < math.pi:
+            anywhere = replace(prior, max_rotation=math.pi)
+            least = score(best, spots.gains(frame)) + decades_apart(options) * math.log(10)
+            other = find_better(spots, frame, anywhere, options, _LOG10_RIVAL, least)
+            if other is not None:
+                return contradicted_orientation(best, other, prior, len(frame))
+        rest = np.setdiff1d(np.arange(len(spots.mm)), best.spot_of_line)
+        if not is_near and len(rest) >= options.min_inliers:
+            fewest = best.inliers - _FEWER_RODS
+            other = find_better(spots.only(rest), frame, prior, options, _LOG10_RIVAL, fewest=fewest)
+            if other is not None:
+                return second_frame(best, other, len(frame))
+    except SearchGivenUpError:
+        return Verdict(
             "no_consensus",
-            f"chance alone would bring 10^{best.log10_false_alarms:.1f} matches as good as the best one, of "
-            f"{best.inliers} rods among {count} spots; at most 10^{options.max_log10_false_alarms:.3g} are allowed",
-            estimates,
+            f"a pose of {best.inliers} rods was found, but the search for one that contradicts it among "
+            f"{len(spots.mm)} spots took too long: raise the threshold, or reduce clutter",
         )
-    plausibility = float(gammaincc(best.degrees_of_freedom / 2, best.chi_square / 2))
-    if plausibility < _IMPLAUSIBLE:
-        return refuse(
-            "inaccurate",
-            f"the residual of {best.residual_rms_px:.2f} pixel RMS over {best.inliers} rods cannot come from a spot "
-            f"noise of {options.spot_noise_px:g} pixel: wrong pixel spacing, frame or noise",
-            estimates,
-        )
-    if len(estimates) > 1:
-        return refuse("ambiguous", _describe_ambiguity(estimates), estimates)
-    if best.rotation_std_deg > _DEGENERATE_ROTATION_DEG:
-        axis = np.linalg.eigh(best.covariance[3:, 3:])[1][:, -1]
-        return refuse(
-            "degenerate",
-            f"the rotation about the axis {np.round(axis, 2).tolist()} of the scanner is known only to "
-            f"{best.rotation_std_deg:.1f} degrees",
-            estimates,
-        )
-    if best.position_std_mm > options.max_position_std_mm:
-        return refuse(
-            "inaccurate",
-            f"the position has a standard deviation of {best.position_std_mm:.2f} mm, "
-            f"at most {options.max_position_std_mm:g} mm are allowed",
-            estimates,
-        )
-    target_error_mm = best.target_error_95_mm(options.target_in_frame_mm)
-    if target_error_mm > options.max_target_error_mm:
-        target = ", ".join(f"{value:g}" for value in options.target_in_frame_mm)
-        return refuse(
-            "inaccurate",
-            f"95 % of the errors at the target ({target}) mm of the frame are within {target_error_mm:.2f} mm, "
-            f"{options.max_target_error_mm:g} mm are allowed",
-            estimates,
-        )
-    cautions = []
-    if plausibility < _DOUBTFUL:
-        cautions.append(
-            f"the residual of {best.residual_rms_px:.2f} pixel RMS is large for a spot noise of "
-            f"{options.spot_noise_px:g} pixel"
-        )
-    if best.position_std_mm > _WEAK_POSITION_MM or best.rotation_std_deg > _WEAK_ROTATION_DEG:
-        cautions.append(
-            f"weakly determined: standard deviation {best.position_std_mm:.2f} mm, {best.rotation_std_deg:.2f} degrees"
-        )
-    caution = "; ".join(cautions)
-    return Registration(frame, scale, options, spots_px, best, caution, covariances_px2)
+    return None
+
+
+def _tolerances(
+    frame: Frame, scale: PixelScale, options: RegistrationOptions, scale_covariance: Array | None
+) -> Tolerances:
+    rods_mm = frame.tolerances_or(options.frame_tolerance_mm)
+    return Tolerances.of(frame, rods_mm, scale, options.scale_tolerance, scale_covariance, options.slice_thickness_mm)
 
 
 def _streaks(found: FoundSpots, scale: PixelScale, thickness_mm: float) -> Streaks:
@@ -293,42 +308,65 @@ def at_least(covariances_px2: Array, noise_px: float) -> Array:
     return raised
 
 
-def _noise_mm(scale: PixelScale, noise_px: float) -> float:
-    return noise_px * max(scale.sx, scale.sy)
-
-
-def _estimate(
-    hypothesis: Hypothesis,
-    is_best: bool,
-    spots_px: Array,
-    weighted_px2: Array,
-    frame: Frame,
-    scale: PixelScale,
-    scanner_from_slice: Pose,
-    scale_covariance: Array | None,
-) -> PoseEstimate:
+def _estimate(hypothesis: Hypothesis, is_best: bool, spots: Spots, frame: Frame, seen: _Seen) -> PoseEstimate:
     slice_from_frame = Pose(hypothesis.rotation, hypothesis.translation)
-    predicted_px, _ = project(frame, slice_from_frame, scale)
+    predicted_px, cuts = project(frame, slice_from_frame, seen.scale)
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
-    spots = hypothesis.spot_of_line[lines]
-    distances = point_line_distances(frame, lines, slice_from_frame, scale.to_mm(spots_px[spots]))
+    rows = hypothesis.spot_of_line[lines]
+    distances = point_line_distances(frame, lines, slice_from_frame, spots.mm[rows])
+    whitening = whitening_of(spots.match_covariances(frame, cuts, hypothesis.spot_of_line)[lines])
+    used = hypothesis.spot_of_line != UNMATCHED
+    common = spots.tolerances.common(frame, cuts, spots.mm[hypothesis.spot_of_line], used)[lines]
+    whitened = _whitened(slice_from_frame, cuts, lines, spots, rows, whitening, common, seen)
     covariance = _covariance(hypothesis.information)
     if is_best and _is_weak(covariance):
-        whitening = np.linalg.inv(np.linalg.cholesky(scale.matrix @ weighted_px2[spots] @ scale.matrix.T))
-        covariance = covariance_along_valley(frame, slice_from_frame, lines, scale.to_mm(spots_px[spots]), whitening)
-    if scale_covariance is not None:
-        by_scale = scale_sensitivity(frame, lines, slice_from_frame, spots_px[spots], weighted_px2[spots], scale)
-        covariance = covariance + by_scale @ scale_covariance @ by_scale.T
+        covariance = covariance_along_valley(frame, slice_from_frame, lines, spots.mm[rows], whitening, common)
     return PoseEstimate(
         slice_from_frame=slice_from_frame,
-        scanner_from_frame=scanner_from_slice @ slice_from_frame,
-        covariance=in_scanner_axes(covariance, scanner_from_slice),
+        scanner_from_frame=seen.scanner_from_slice @ slice_from_frame,
+        covariance=in_scanner_axes(covariance + whitened.covariance_by_shifts(), seen.scanner_from_slice),
         matches=tuple(
-            Match(frame.line_names[line], int(line), int(spot), spots_px[spot], predicted_px[line], float(distance))
-            for line, spot, distance in zip(lines, spots, distances, strict=True)
+            Match(
+                frame.line_names[line], int(line), int(spot), seen.spots_px[spot], predicted_px[line], float(distance)
+            )
+            for line, spot, distance in zip(lines, rows, distances, strict=True)
         ),
         chi_square=hypothesis.chi_square,
         log10_false_alarms=hypothesis.log10_false_alarms,
+        scale_misfit=whitened.scale_misfit(),
+    )
+
+
+def _whitened(
+    slice_from_frame: Pose,
+    cuts: Cuts,
+    lines: NDArray[np.intp],
+    spots: Spots,
+    rows: NDArray[np.intp],
+    whitening: Array,
+    common: Array,
+    seen: _Seen,
+) -> Whitened:
+    """The residuals of the matched rods at a pose.
+
+    A scale that is off moves all spots away from the point that the scanner's origin has in the slice: pixel (0, 0)
+    where the scanner is the slice, else the point nearest to the scanner's origin, as a scanner's images are
+    reconstructed about its axis.
+    """
+    residual = spots.mm[rows] - cuts.points_mm[lines]
+    jacobian = cut_jacobian(cuts, slice_from_frame.translation)[lines]
+    origin_mm = seen.scanner_from_slice.inverse().translation[:2]
+    stretches = spots.tolerances.stretches
+    is_scale = np.arange(common.shape[-1]) < len(stretches)
+    shifts = np.zeros((6, common.shape[-1]))
+    shifts[:2, is_scale] = (stretches @ (spots.mm[rows].mean(axis=0) - origin_mm)).T
+    count = 2 * len(lines)
+    return Whitened(
+        (whitening @ jacobian).reshape(count, 6),
+        (whitening @ common).reshape(count, -1),
+        (whitening @ residual[..., None]).reshape(count),
+        shifts,
+        is_scale,
     )
 
 
@@ -337,9 +375,7 @@ def _is_weak(covariance: Array) -> bool:
     position = math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     rotation_deg = math.degrees(math.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
     # What is not determined at all has no end to walk to, and is refused.
-    return rotation_deg < _DEGENERATE_ROTATION_DEG and (
-        position > _WEAK_POSITION_MM or rotation_deg > _WEAK_ROTATION_DEG
-    )
+    return rotation_deg < DEGENERATE_ROTATION_DEG and (position > WEAK_POSITION_MM or rotation_deg > WEAK_ROTATION_DEG)
 
 
 def _covariance(information: Array) -> Array:
@@ -347,26 +383,3 @@ def _covariance(information: Array) -> Array:
     values, vectors = np.linalg.eigh(information)
     covariance: Array = (vectors / np.maximum(values, 1e-12)) @ vectors.T
     return covariance
-
-
-def _describe_nothing(found: Found, lines: int, spots: int, options: RegistrationOptions) -> str:
-    nothing = f"no pose puts {min(found.least_rods, lines)} of the {lines} rods on any of the {spots} spots"
-    if found.least_rods <= options.min_inliers:
-        return nothing
-    fewer = f"{found.least_rods - 1} rods could hardly be told from chance among so many spots"
-    return f"{nothing}, and {fewer}" if found.least_rods <= lines else fewer
-
-
-def _describe_ambiguity(estimates: tuple[PoseEstimate, ...]) -> str:
-    poses = []
-    for estimate in estimates:
-        pose = estimate.scanner_from_frame
-        position = ", ".join(f"{value:.1f}" for value in pose.translation)
-        turn = ", ".join(f"{value:.3f}" for value in pose.quaternion_xyzw)
-        poses.append(f"position ({position}) mm, quaternion ({turn}), residual {estimate.residual_rms_mm:.2f} mm")
-    more = math.inf if len(poses) > 8 else 0
-    listed = "; ".join(poses[:8]) + ("; and more" if more else "")
-    return (
-        f"{len(estimates)} poses explain the slice equally well, tell them apart by nominal_orientation and "
-        f"max_rotation_deg: {listed}"
-    )

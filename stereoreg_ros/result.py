@@ -16,7 +16,15 @@ from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.uncertainty import error_ball_95, point_covariance
 
 Reason = Literal[
-    "too_few_spots", "no_consensus", "ambiguous", "degenerate", "inaccurate", "bad_image", "bad_frame", "skipped"
+    "too_few_spots",
+    "no_consensus",
+    "ambiguous",
+    "degenerate",
+    "inaccurate",
+    "contradicted",
+    "bad_image",
+    "bad_frame",
+    "skipped",
 ]
 REASONS: Final[tuple[Reason, ...]] = (
     "too_few_spots",
@@ -24,6 +32,7 @@ REASONS: Final[tuple[Reason, ...]] = (
     "ambiguous",
     "degenerate",
     "inaccurate",
+    "contradicted",
     "bad_image",
     "bad_frame",
     "skipped",
@@ -59,7 +68,9 @@ class PoseEstimate:
     slice_from_frame, scanner_from_frame: the pose, mm. covariance: (6, 6), position (mm) then rotation vector (rad),
     in scanner axes, of the perturbation of `Pose.perturbed` on scanner_from_frame; this is the order of ROS.
     chi_square: sum of the squared residuals over the noise, with `degrees_of_freedom`.
-    log10_false_alarms: log10 of how many as good explanations chance alone would bring.
+    log10_false_alarms: log10 of how many as good explanations chance alone would bring. scale_misfit: by how much
+    chi-square falls where the pixel spacing is free; by the stated errors alone it is chi-square distributed, with two
+    degrees of freedom.
     """
 
     slice_from_frame: Pose
@@ -68,6 +79,7 @@ class PoseEstimate:
     matches: tuple[Match, ...]
     chi_square: float
     log10_false_alarms: float
+    scale_misfit: float = 0.0
 
     @property
     def inliers(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,8 +11,11 @@ from scipy.special import gammaincinv
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, skew
-from stereoreg_ros.geometry.projection import cut_jacobian, project, projection_jacobian
+from stereoreg_ros.geometry.projection import project, projection_jacobian
 from stereoreg_ros.geometry.slice import PixelScale
+
+# A scale that the spots say so little of, in standard deviations of what is stated, is not judged by them.
+_LEAST_INFORMATION: Final = 1e-4
 
 
 def cramer_rao_pose(
@@ -44,29 +48,52 @@ def point_covariance(covariance: Array, scanner_from_frame: Pose, point_in_frame
     return moved
 
 
-def scale_sensitivity(
-    frame: Frame,
-    lines: NDArray[np.intp],
-    slice_from_frame: Pose,
-    spots_px: Array,
-    covariances_px2: Array,
-    scale: PixelScale,
-) -> Array:
-    """d pose / d (sx, sy, shear), (6, 3) in mm and rad per mm/pixel, of the maximum-likelihood pose slice_from_frame.
+class Whitened(NamedTuple):
+    """The residuals of k rods at a pose slice_from_frame, in standard deviations, and what moves them.
 
-    spots_px (n, 2), covariances_px2 (n, 2, 2): of the given rods (n,), the covariances as they weight the pose. A scale
-    that grows by dS moves a spot Q by dS Q in the slice, and the pose follows as it would follow that spot.
+    by_pose: (2k, 6), their Jacobian by the pose (see `Pose.perturbed`); by_common: (2k, c), by errors that all spots
+    share, of unit variance each; residual: (2k,), spot less prediction. shifts: (6, c), how far each of these errors
+    moves the pose besides, as it moves all spots alike. scale: (c,), which of them are errors of the scale.
     """
-    _, cuts = project(frame, slice_from_frame, scale)
-    jacobian = cut_jacobian(cuts, slice_from_frame.translation)[lines]
-    weights = np.linalg.inv(scale.matrix @ covariances_px2 @ scale.matrix.T)
-    weighted = np.swapaxes(jacobian, 1, 2) @ weights
-    moved = np.zeros((len(lines), 2, 3))
-    moved[:, 0, 0] = spots_px[:, 0]
-    moved[:, 1, 1] = spots_px[:, 1]
-    moved[:, 0, 2] = spots_px[:, 1]
-    information = (weighted @ jacobian).sum(axis=0)
-    return np.asarray(np.linalg.pinv(information, hermitian=True) @ (weighted @ moved).sum(axis=0), dtype=np.float64)
+
+    by_pose: Array
+    by_common: Array
+    residual: Array
+    shifts: Array
+    scale: NDArray[np.bool_]
+
+    def covariance_by_shifts(self) -> Array:
+        """What is to be added for the shifts to the pose's covariance (6, 6), the inverse of its information.
+
+        With the shared errors c integrated out, the pose's error is P (noise + N c) + T c: P the pose's sensitivity to
+        the residuals, N `by_common`, T `shifts`. That of the first term is the inverse of the information.
+        """
+        inner = np.linalg.inv(np.eye(self.by_common.shape[1]) + self.by_common.T @ self.by_common)
+        weighted = self.by_pose - self.by_common @ inner @ (self.by_common.T @ self.by_pose)
+        covariance = np.linalg.pinv(weighted.T @ self.by_pose, hermitian=True)
+        cross = covariance @ weighted.T @ self.by_common @ self.shifts.T
+        added: Array = cross + cross.T + self.shifts @ self.shifts.T
+        return added
+
+    def scale_misfit(self) -> float:
+        """By how much chi-square falls where the scale is free instead of known as well as stated.
+
+        Where everything is as stated it is distributed as chi-square, with a degree of freedom for each error of the
+        scale.
+        """
+        if not self.scale.any():
+            return 0.0
+        estimated = np.linalg.solve(
+            np.eye(self.by_common.shape[1]) + self.by_common.T @ self.by_common, self.by_common.T @ self.residual
+        )[self.scale]
+        free, other = self.by_common[:, self.scale], self.by_common[:, ~self.scale]
+        rest = np.hstack([self.by_pose, other])
+        inner = rest.T @ rest
+        inner[6:, 6:] += np.eye(other.shape[1])
+        information = free.T @ free - free.T @ rest @ np.linalg.pinv(inner, hermitian=True) @ rest.T @ free
+        values, vectors = np.linalg.eigh(information)
+        along = vectors.T @ estimated
+        return float((along**2 * (1.0 + 1.0 / np.maximum(values, _LEAST_INFORMATION))).sum())
 
 
 def checked_scale_covariance(scale_covariance: ArrayLike) -> Array:

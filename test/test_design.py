@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from joblib import parallel_config
 
-from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
+from stereoreg_ros import PixelScale, Refusal, Registration, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.cli import main
+from stereoreg_ros.design import ambiguity as ambiguity_module
 from stereoreg_ros.design import proposal as proposal_module
 from stereoreg_ros.design import search as search_module
 from stereoreg_ros.design.ambiguity import trials
@@ -25,9 +26,12 @@ from stereoreg_ros.design.meeting import meetings
 from stereoreg_ros.design.proposal import propose
 from stereoreg_ros.design.search import Wish, random_layouts, search
 from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.projection import cut, rod_covariances
 
 SCALE = PixelScale(0.5, 0.5)
 OPTIONS = RegistrationOptions(slice_thickness_mm=1.0, target_in_frame_mm=(0.0, 100.0, 0.0))
+# Rods where they are drawn, a scale as it is stated, and no limit to the target's error.
+PERFECT = replace(OPTIONS, frame_tolerance_mm=0.0, scale_tolerance=0.0, max_target_error_mm=1000.0)
 
 
 def wish(rods: int = 6, **changes: Any) -> Wish:
@@ -104,7 +108,7 @@ class TestSearch:
             wish(**changes)
 
     def test_a_proposal_is_tried_with_each_rod_missing(self) -> None:
-        made = propose(wish(), "mine", OPTIONS, seed=4, chains=1)
+        made = propose(wish(), "mine", PERFECT, seed=4, chains=1)
         assert made.frame.name == "mine"
         assert made.ambiguous == 0
         assert made.tried == 7 * 20
@@ -122,7 +126,7 @@ def side_faces() -> Frame:
 
 class TestInspection:
     def test_a_symmetric_frame_is_ambiguous_and_its_twins_are_named(self) -> None:
-        options = replace(OPTIONS, max_log10_false_alarms=-1.0, spot_noise_px=0.05)
+        options = replace(PERFECT, max_log10_false_alarms=-1.0, spot_noise_px=0.05)
         found = inspect_frame(side_faces(), options, SCALE, largest_tilt_deg=10.0, count=40)
         record = found.record()
         assert record["outcomes"].get("ambiguous", 0) > 20
@@ -132,7 +136,7 @@ class TestInspection:
         assert any("twin" in line for line in table_of(found))
 
     def test_the_shipped_frame(self) -> None:
-        found = inspect_frame(load_frame("cube6"), OPTIONS, SCALE, count=30)
+        found = inspect_frame(load_frame("cube6"), PERFECT, SCALE, count=30)
         record = json.loads(json.dumps(found.record(), allow_nan=False))
         assert record["poses"] == 30
         assert record["wrong"] == 0
@@ -152,9 +156,34 @@ class TestInspection:
         starts = np.array([[-30.0, -30, -30], [30, -30, -30], [30, 30, -30], [-30, 30, -30], [0, 5, -30]])
         ends = starts + np.array([[5.0, 2, 60], [-2, 6, 60], [-6, 1, 60], [3, -5, 60], [4, 4, 60]])
         frame = Frame("upright", tuple("abcde"), starts, ends, np.ones(5))
-        found = inspect_frame(frame, OPTIONS, SCALE, largest_tilt_deg=5.0, count=10)
+        found = inspect_frame(frame, PERFECT, SCALE, largest_tilt_deg=5.0, count=10)
         assert abs(found.weakest_axis[2]) > 0.95
         assert found.position_std_mm[2] > 1.5 * found.position_std_mm[:2].max()
+
+    def test_tolerances_make_larger_errors_and_are_told(self) -> None:
+        cube = load_frame("cube6")
+        own = replace(cube, tolerances_mm=np.array([0.5, 0.5, 0.5, 0.5, 0.5, np.nan]), orientation_required=True)
+        options = replace(PERFECT, frame_tolerance_mm=0.1, scale_tolerance=0.004)
+        found = [
+            inspect_frame(frame, with_these, SCALE, count=4, progress=lambda _share: False)
+            for frame, with_these in ((cube, PERFECT), (cube, options), (own, options))
+        ]
+        perfect, stated, worse = (np.median(one.error_target_mm) for one in found)
+        assert perfect < stated < worse
+        record = found[2].record()
+        assert record["tolerances_mm"] == {**dict.fromkeys("abcde", 0.5), "f": 0.1}
+        assert (record["scale_tolerance"], record["orientation_required"]) == (0.004, True)
+        tables = ["\n".join(table_of(one)) for one in found]
+        assert "rods' ends to 0.1 mm per axis (frame_tolerance_mm), scale to 0.4 %" in tables[1]
+        assert "a 0.5, b 0.5, c 0.5, d 0.5, e 0.5, f 0.1 mm per axis (frame file, frame_tolerance_mm)" in tables[2]
+        assert "without a nominal orientation the frame is refused" in tables[2]
+        assert "orientation" not in tables[1]
+
+    def test_says_that_handedness_cannot_be_seen(self) -> None:
+        found = inspect_frame(load_frame("cube6"), PERFECT, SCALE, count=4, progress=lambda _share: False)
+        (caution,) = found.record()["cautions"]
+        assert caution in table_of(found)
+        assert "axes must be right-handed: a mirrored image" in caution
 
     def test_cut_short(self) -> None:
         found = inspect_frame(load_frame("cube6"), OPTIONS, SCALE, count=20, progress=lambda share: share < 0.3)
@@ -169,9 +198,32 @@ class TestInspection:
     def test_trials_see_a_missing_rod(self) -> None:
         frame = load_frame("cube6")
         poses = meetings(3, 0, np.zeros(3), np.array([0.0, 0.0]), 5.0)
-        made = list(trials(frame, poses, SCALE, OPTIONS, [None, 2], np.random.default_rng(0)))
+        made = list(trials(frame, poses, SCALE, PERFECT, [None, 2], np.random.default_rng(0)))
         assert [trial.left_out for trial in made] == [None, 2] * 3
         assert all(not trial.reason and trial.right and not trial.twins for trial in made)
+
+    def test_trials_are_of_frames_and_scales_within_the_tolerance(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The spots that the registration is given, over many trials of one pose."""
+        frame, options = load_frame("cube6"), replace(OPTIONS, frame_tolerance_mm=0.4, spot_noise_px=0.001)
+        one = meetings(1, 0, np.zeros(3), np.array([0.0, 0.0]), 0.0)
+        poses = one.take(np.zeros(1500, dtype=int))
+        refusal = register_spots(np.zeros((0, 2)), frame, SCALE)
+        given: list[np.ndarray] = []
+
+        def noted(spots_px: np.ndarray, *_: object, **__: object) -> Registration | Refusal:
+            given.append(SCALE.to_mm(spots_px))
+            return refusal
+
+        monkeypatch.setattr(ambiguity_module, "register_spots", noted)
+        for tolerance_mm, scale_tolerance in ((0.4, 0.0), (0.0, 0.01)):
+            given.clear()
+            so = replace(options, frame_tolerance_mm=tolerance_mm, scale_tolerance=scale_tolerance)
+            list(trials(frame, poses, SCALE, so, [None], np.random.default_rng(1)))
+            spots = np.array(given)
+            cuts = cut(frame, one.rotations[0], one.translations[0])
+            by_rods = np.einsum("nii->ni", rod_covariances(frame, np.full(len(frame), tolerance_mm), cuts))
+            np.testing.assert_allclose(spots.mean(axis=0), cuts.points_mm, atol=0.1)
+            np.testing.assert_allclose(spots.var(axis=0), by_rods + (scale_tolerance * cuts.points_mm) ** 2, rtol=0.15)
 
 
 class TestCommands:
@@ -187,13 +239,16 @@ class TestCommands:
     @pytest.mark.usefixtures("quick")
     def test_design(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         told = ["--name", "mine", "--lines", "6", "--chains", "1", "--poses", "12"]
+        told += ["--frame-tolerance-mm", "0", "--scale-tolerance", "0", "--max-target-error-mm", "1000"]
         assert main(["design", *told, "--output", str(tmp_path)]) == 0
         assert "mine: 6 rods" in capsys.readouterr().out
         frame = load_frame(tmp_path / "mine.yaml")
         assert len(frame) == 6
         assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.png", "mine.txt", "mine.yaml"]
-        comment = [line for line in (tmp_path / "mine.yaml").read_text().splitlines() if line.startswith("#")]
-        assert any("stereoreg design --name mine --lines 6" in line for line in comment)
+        comment = " ".join(line[2:] for line in (tmp_path / "mine.yaml").read_text().splitlines() if line[0] == "#")
+        assert "stereoreg design --name mine --lines 6" in comment
+        assert "--frame-tolerance-mm 0 --scale-tolerance 0" in comment
+        assert "Axes, right-handed" in comment
 
     @pytest.mark.parametrize(
         ("arguments", "told"),

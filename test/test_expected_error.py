@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stereoreg_ros import PixelScale, load_frame
+from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.design.expected_error import (
     Imaging,
     expected,
@@ -18,7 +19,7 @@ from stereoreg_ros.design.expected_error import (
 from stereoreg_ros.design.layouts import Layouts
 from stereoreg_ros.design.meeting import meetings
 from stereoreg_ros.geometry.pose import Pose, rotation_angle, rotation_exp
-from stereoreg_ros.geometry.projection import cut, project
+from stereoreg_ros.geometry.projection import cut, cut_jacobian, project
 from stereoreg_ros.simulation import ScannerSettings
 from stereoreg_ros.simulation.rendering import Cylinder, add_metal
 from stereoreg_ros.solvers.maximum_likelihood import refine
@@ -47,6 +48,57 @@ def test_a_rod_left_out() -> None:
     assert not less.visible[..., 2].any()
     more = expected(Layouts.of(frame), poses, UPRIGHT)
     assert (np.linalg.eigvalsh(less.covariances - more.covariances) > -1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("tolerance_mm", "scale_tolerance"), [(0.4, 0.0), (0.0, 0.01), (0.3, 0.005)], ids=["rods", "scale", "both"]
+)
+def test_errors_of_rods_and_scale_are_those_of_simulated_frames(tolerance_mm: float, scale_tolerance: float) -> None:
+    """Rods whose ends are off are cut where they are, in slices that are stretched: the covariance of the spots that
+    this brings, from thousands of frames, and the bound that it makes."""
+    frame, poses = load_frame("cube6"), level(4)
+    imaging = Imaging(SCALE, 0.1, 0.0, tolerance_mm, scale_tolerance)
+    found = expected(Layouts.of(frame), poses, imaging)
+    rng, drawn = np.random.default_rng(8), 6000
+    off = tolerance_mm * rng.standard_normal((2, drawn, len(frame), 3))
+    built = Layouts(frame.starts + off[0], frame.ends + off[1], frame.diameters)
+    for row in range(len(poses)):
+        lines = np.flatnonzero(found.visible[0, row])
+        shifted = cut(built, poses.rotations[row], poses.translations[row]).points_mm[:, 0][:, lines]
+        stretch = 1 + scale_tolerance * rng.standard_normal((drawn, 1, 2))
+        noise = 0.1 * 0.5 * rng.standard_normal(shifted.shape)
+        spots = (shifted * stretch + noise).reshape(drawn, -1)
+        jacobian = cut_jacobian(found.cuts, poses.translations)[0, row, lines].reshape(-1, 6)
+        wanted = np.linalg.inv(jacobian.T @ np.linalg.solve(np.cov(spots.T), jacobian))
+        # In units in which the expected covariance is the identity, all directions count alike.
+        root = np.linalg.cholesky(np.linalg.inv(found.covariances[0, row]))
+        np.testing.assert_allclose(root.T @ wanted @ root, np.eye(6), atol=0.1)
+
+
+def test_the_tolerance_of_the_frame_goes_before_that_of_the_options() -> None:
+    frame, poses = load_frame("cube6"), level(4)
+    own = replace(frame, tolerances_mm=np.array([0.3, 0.3, 0.3, np.nan, np.nan, 0.3]))
+    by_frame = expected(Layouts.of(own), poses, Imaging(SCALE, 0.3, 0.0, 0.3)).covariances
+    by_option = expected(Layouts.of(frame), poses, Imaging(SCALE, 0.3, 0.0, 0.3)).covariances
+    np.testing.assert_array_equal(by_frame, by_option)
+    larger = expected(Layouts.of(own), poses, Imaging(SCALE, 0.3, 0.0, 0.5)).covariances
+    assert (np.linalg.eigvalsh(larger - by_frame) > -1e-12).all()
+    assert (np.linalg.eigvalsh(larger - by_frame)[..., -1] > 1e-4).all()
+
+
+@pytest.mark.parametrize(("scale_tolerance", "most"), [(0.0, 1.1), (0.002, 1.5)])
+def test_is_what_the_registration_states(scale_tolerance: float, most: float) -> None:
+    """Nearly so where the scale may be off: what the spots say of it does not move the frame as a whole."""
+    frame, poses = load_frame("cube6"), level(6, 10.0)
+    options = RegistrationOptions(scale_tolerance=scale_tolerance, max_target_error_mm=100.0)
+    bound = expected(Layouts.of(frame), poses, Imaging.of(SCALE, options)).covariances[0]
+    for row in range(len(poses)):
+        spots, cuts = project(frame, poses.pose(row), SCALE)
+        result = register_spots(spots[cuts.inside], frame, SCALE, options)
+        assert result, result.message
+        ratios = np.linalg.eigvals(np.linalg.solve(bound[row], result.covariance)).real
+        assert ratios.min() > 0.9
+        assert ratios.max() < most
 
 
 def test_pooled_error_of_one_pose_is_its_ball() -> None:

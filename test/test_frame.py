@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from frames import random_frame
+from frames import random_frame, random_slice_from_frame
 
 from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Pose
+from stereoreg_ros.geometry.projection import cut
 
 STARTS = np.array([[0, 0, -5], [10, 0, -5], [0, 10, -5]], dtype=float)
 ENDS = np.array([[0, 0, 5], [10, 3, 5], [2, 10, 5]], dtype=float)
@@ -60,14 +63,40 @@ class TestDerived:
     def test_length_is_the_number_of_rods(self, frame: Frame) -> None:
         assert len(frame) == 7
 
+    def test_tolerances_are_unknown_unless_they_are_given(self, frame: Frame) -> None:
+        np.testing.assert_array_equal(frame.tolerances_or(0.3), np.full(7, 0.3))
+        assert not frame.orientation_required
+        some = frame_with(tolerances_mm=np.array([0.1, np.nan, 0.0]), orientation_required=True)
+        np.testing.assert_array_equal(some.tolerances_or(0.3), [0.1, 0.3, 0.0])
+        assert some.orientation_required
+
     def test_keeps_its_own_copy_that_cannot_be_written(self) -> None:
         starts = STARTS.copy()
         frame = frame_with(starts=starts)
         starts[0, 0] = 99.0
         assert frame.starts[0, 0] == 0.0
-        for array in (frame.starts, frame.directions, frame.origins, frame.moments, frame.lambda_max):
+        tolerances = np.full(3, 0.2)
+        frame = frame_with(starts=starts, tolerances_mm=tolerances)
+        tolerances[0] = 9.0
+        np.testing.assert_array_equal(frame.tolerances_or(0.0), [0.2, 0.2, 0.2])
+        known = np.asarray(frame.tolerances_mm)
+        for array in (frame.starts, frame.directions, frame.origins, frame.moments, frame.lambda_max, known):
             with pytest.raises(ValueError, match="read-only"):
                 array[0] = 0.0
+
+
+def test_a_mirrored_frame_is_cut_at_the_same_points() -> None:
+    """Why one slice cannot show that a file's axes are left-handed: the mirror image has a pose of its own for it."""
+    rng = np.random.default_rng(5)
+    frame = random_frame(rng, 6)
+    pose = random_slice_from_frame(rng, frame)
+    x_mirrored, plane = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, 1.0, -1.0])
+    mirrored = replace(frame, starts=frame.starts @ x_mirrored, ends=frame.ends @ x_mirrored)
+    other = Pose(plane @ pose.rotation @ x_mirrored, plane @ pose.translation)
+    cuts = cut(frame, pose.rotation, pose.translation)
+    found = cut(mirrored, other.rotation, other.translation)
+    np.testing.assert_allclose(found.points_mm, cuts.points_mm, atol=1e-9)
+    np.testing.assert_array_equal(found.inside, cuts.inside)
 
 
 @pytest.mark.parametrize(
@@ -88,6 +117,9 @@ class TestDerived:
         ({"starts": STARTS * [1, 1, np.inf]}, "starts must be finite"),
         ({"ends": np.where(ENDS == 3, np.nan, ENDS)}, "ends must be finite"),
         ({"ends": np.array([ENDS[0], STARTS[1], ENDS[2]])}, "line 'b' has no length"),
+        ({"tolerances_mm": np.array([0.1, -0.1, 0.1])}, "line 'b' has tolerance -0.1, expected 0 mm or more"),
+        ({"tolerances_mm": np.array([0.1, 0.1, np.inf])}, "line 'c' has tolerance inf, expected 0 mm or more"),
+        ({"tolerances_mm": np.ones((3, 1))}, r"tolerances_mm has shape \(3, 1\), expected \(3,\)"),
     ],
 )
 def test_what_is_no_frame(changes: dict[str, Any], told: str) -> None:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
 
-from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame, shipped_frames
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.frame_file import FrameFileError, frame_text, load_frame, shipped_frames
 
 GOOD = """\
 name: block
@@ -59,6 +63,28 @@ class TestGood:
         content = b"\xef\xbb\xbf" + GOOD.replace("name: a", "name: \u00e4").replace("\n", "\r\n").encode()
         assert load_frame(written(tmp_path, content)).line_names == ("\u00e4", "b", "c")
 
+    def test_tolerances_of_the_frame_and_of_one_rod(self, tmp_path: Path) -> None:
+        content = GOOD.replace("name: block", "name: block\ntolerance_mm: 0.25\norientation_required: true")
+        frame = load_frame(written(tmp_path, content.replace("diameter: 1.5", "diameter: 1.5, tolerance_mm: 0")))
+        np.testing.assert_array_equal(frame.tolerances_or(9.0), [0.25, 0.0, 0.25])
+        assert frame.orientation_required
+
+    def test_what_is_not_said_of_tolerances_is_unknown(self, tmp_path: Path) -> None:
+        frame = load_frame(written(tmp_path, GOOD.replace("diameter: 1.5", "diameter: 1.5, tolerance_mm: 0.1")))
+        np.testing.assert_array_equal(frame.tolerances_or(0.3), [0.3, 0.1, 0.3])
+        assert not frame.orientation_required
+
+    @pytest.mark.parametrize(("word", "meant"), [("true", True), ("False", False), ("yes", True), ("off", False)])
+    def test_orientation_required_in_all_of_yamls_words(self, word: str, meant: bool, tmp_path: Path) -> None:
+        content = GOOD.replace("name: block", f"name: block\norientation_required: {word}")
+        assert load_frame(written(tmp_path, content)).orientation_required is meant
+
+    def test_rods_that_meet_in_a_corner_may_have_a_tolerance(self, tmp_path: Path) -> None:
+        content = GOOD.replace("[10, -10, -20]", "[-10, -10, -20]").replace(
+            "diameter: 1.5", "diameter: 1, tolerance_mm: 1"
+        )
+        assert load_frame(written(tmp_path, content)).tolerances_or(0.0)[1] == 1.0
+
     def test_a_file_in_the_working_folder_goes_before_a_shipped_name(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -67,9 +93,43 @@ class TestGood:
         assert load_frame("cube6").name == "block"
 
 
+COORDINATES = st.integers(-99_000_000, 99_000_000).map(lambda thousandths: thousandths / 1000)
+TOLERANCES = st.one_of(st.none(), st.floats(0.0, 0.4))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    corners=st.lists(st.tuples(COORDINATES, COORDINATES, COORDINATES), min_size=3, max_size=8, unique=True),
+    tolerances=st.one_of(st.lists(TOLERANCES, min_size=8, max_size=8), TOLERANCES.map(lambda one: [one] * 8)),
+    required=st.booleans(),
+    diameter=st.integers(1, 20_000).map(lambda thousandths: thousandths / 1000),
+)
+def test_what_is_written_is_read_again(
+    tmp_path: Path,
+    corners: list[tuple[float, ...]],
+    tolerances: list[float | None],
+    required: bool,
+    diameter: float,
+) -> None:
+    starts, n = np.array(corners), len(corners)
+    # Rods of 60 mm, apart by far more than any tolerance where their starts are.
+    assume(all(np.linalg.norm(starts[i] - starts[j]) > 10 for i in range(n) for j in range(i)))
+    ends = np.round(starts + np.array([10.0, -20.0, 60.0]), 3)
+    given_mm = np.array([np.nan if one is None else one for one in tolerances[:n]])
+    names = tuple(f"rod {i}" for i in range(n))
+    frame = Frame("any", names, starts, ends, np.full(n, diameter), given_mm, required)
+    again = load_frame(written(tmp_path, frame_text(frame, "a comment:\n- of two lines")))
+    assert (again.name, again.line_names, again.orientation_required) == ("any", names, required)
+    for one, other in ((again.starts, starts), (again.ends, ends), (again.diameters, frame.diameters)):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(again.tolerances_or(np.nan), given_mm)
+
+
 class TestShipped:
     def test_what_is_shipped(self) -> None:
-        assert set(shipped_frames()) >= {"cube6", "leksell_ct", "zframe", "catphan_ctp404"}
+        assert set(shipped_frames()) == {
+            *("cube5", "cube6", "cube8", "leksell_ct", "leksell_ct9", "brw", "zframe", "catphan_ctp404")
+        }
 
     @pytest.mark.parametrize("name", sorted(shipped_frames()))
     def test_loads_by_name_and_by_path(self, name: str) -> None:
@@ -161,6 +221,68 @@ FAULTS: dict[str, tuple[str, str, int, str]] = {
     "tab": ("    from: [0", "\tfrom: [0", 7, "is not valid YAML"),
     "unknown alias": ("[3, 10, +20]", "*nowhere", 8, "is not valid YAML: found undefined alias"),
     "a second document": ("    diameter: 2\n", "    diameter: 2\n---\nname: other\n", 10, "is not valid YAML"),
+    "negative tolerance": (
+        "name: block",
+        "name: block\ntolerance_mm: -0.1",
+        2,
+        "tolerance_mm: found -0.1, expected a standard deviation in mm, 0 or more",
+    ),
+    "tolerance NaN": ("name: block", "name: block\ntolerance_mm: nan", 2, "tolerance_mm: found nan, expected a finite"),
+    "infinite tolerance": (
+        "diameter: 1.5",
+        "diameter: 1.5, tolerance_mm: inf",
+        4,
+        "lines[1].tolerance_mm: found inf, expected a finite number",
+    ),
+    "tolerance without a number": ("name: block", "name: block\ntolerance_mm:", 2, "tolerance_mm: found nothing"),
+    "tolerance larger than the rods": (
+        "name: block",
+        "name: block\ntolerance_mm: 60",
+        2,
+        "tolerance_mm: found 60, expected at most a tenth of the 21.2 mm between rods 'a' and 'b'",
+    ),
+    "tolerance of a rod larger than it is long": (
+        "[3, 10, +20]",
+        "[3, 10, -19.5]\n    tolerance_mm: 0.4",
+        9,
+        "lines[2].tolerance_mm: found 0.4, expected at most a tenth of the 3.16 mm that rod 'c' is long",
+    ),
+    "tolerance of a rod between others": (
+        "diameter: 1.5",
+        "diameter: 1.5, tolerance_mm: 3",
+        4,
+        "lines[1].tolerance_mm: found 3, expected at most a tenth of the",
+    ),
+    "tolerance twice": (
+        "name: block",
+        "tolerance_mm: 0.1\ntolerance_mm: 0.2\nname: block",
+        2,
+        "frame file: found key 'tolerance_mm' a second time",
+    ),
+    "orientation_required is no truth": (
+        "name: block",
+        "name: block\norientation_required: maybe",
+        2,
+        "orientation_required: found 'maybe', expected true or false",
+    ),
+    "orientation_required is text": (
+        "name: block",
+        "name: block\norientation_required: 'true'",
+        2,
+        "orientation_required: found 'true', expected true or false",
+    ),
+    "orientation_required is no truth by its tag": (
+        "name: block",
+        "name: block\norientation_required: !!bool 2",
+        2,
+        "orientation_required: found '2', expected true or false",
+    ),
+    "orientation_required of a rod": (
+        "diameter: 1.5",
+        "diameter: 1.5, orientation_required: true",
+        4,
+        "lines[1]: found unknown key 'orientation_required'",
+    ),
     "rods within themselves": (
         GOOD[GOOD.index("lines:") :],
         "lines: &rods [*rods, *rods, *rods]\n",
@@ -196,6 +318,18 @@ class TestFaults:
     )
     def test_what_is_no_frame_file(self, content: bytes, told: str, tmp_path: Path) -> None:
         assert told in fault(written(tmp_path, content))
+
+    @pytest.mark.parametrize("per_mm", [1e-3, 1 / 25.4, 1e3], ids=["metres", "inches", "micrometres"])
+    def test_other_units_than_mm_are_asked_about(self, per_mm: float, tmp_path: Path) -> None:
+        cube = load_frame("cube6")
+        other = replace(cube, starts=cube.starts * per_mm, ends=cube.ends * per_mm)
+        message = fault(written(tmp_path, frame_text(other, "a comment moves the lines")))
+        assert ": line 4, lines: found rods of " in message
+        assert message.endswith("expected at least one of 5 to 2000 mm; metres or inches instead of mm?")
+
+    def test_one_rod_of_a_sane_length_makes_the_unit(self, tmp_path: Path) -> None:
+        short = GOOD.replace("[-10, 5, 20]", "[-10, -10, -19]").replace("[5, -10, 2e1]", "[10, -10, -19]")
+        assert len(load_frame(written(tmp_path, short))) == 3
 
     def test_too_many_rods(self, tmp_path: Path) -> None:
         rods = "".join(f"  - {{name: r{i}, from: [{i}, 0, 0], to: [{i}, 0, 9], diameter: 1}}\n" for i in range(200))

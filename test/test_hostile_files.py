@@ -69,7 +69,8 @@ def test_any_bytes_are_no_frame_and_no_calibration(tmp_path: Path, content: byte
 @given(data=st.data())
 def test_any_value_in_a_place_of_a_frame(tmp_path: Path, data: st.DataObject) -> None:
     rods: list[dict[str, Any]] = [dict(rod) for rod in RODS]
-    root: dict[str, Any] = {"name": "block", "lines": rods}
+    root: dict[str, Any] = {"name": "block", "tolerance_mm": 0.2, "orientation_required": False, "lines": rods}
+    rods[1]["tolerance_mm"] = 0.1
     target = data.draw(st.sampled_from([root, rods[1]]))
     target[data.draw(st.sampled_from(sorted(target)))] = data.draw(VALUES)
     path = tmp_path / "frame.yaml"
@@ -80,6 +81,7 @@ def test_any_value_in_a_place_of_a_frame(tmp_path: Path, data: st.DataObject) ->
         told_of(path, error)
     else:
         assert np.isfinite(frame.moments).all()
+        assert np.isfinite(frame.tolerances_or(0.2)).all()
         assert all(name.isprintable() for name in (frame.name, *frame.line_names))
 
 

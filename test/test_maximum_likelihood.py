@@ -202,6 +202,139 @@ class TestStatistics:
         assert np.linalg.norm(errors, axis=1).mean() < 0.8 * np.linalg.norm(pose_errors(untold, true), axis=1).mean()
 
 
+class TestSharedErrors:
+    """Errors that all spots share, integrated out, against the same as parameters of unit variance to be estimated."""
+
+    MODES = 3
+
+    def drawn(self, seed: int, n: int) -> tuple[Frame, Pose, Array, Array, Array]:
+        """A frame, its pose, spots (n, 2) mm, a whitening (n, 2, 2) of each spot's own, and shared errors."""
+        frame, true, exact = scene(seed, n)
+        rng = np.random.default_rng(seed)
+        root = rng.normal(0, 0.1, (n, 2, 2))
+        covariances = root @ np.swapaxes(root, 1, 2) + 0.1**2 * np.eye(2)
+        common = rng.normal(0, 0.5, (n, 2, self.MODES))
+        noise = (np.linalg.cholesky(covariances) @ rng.standard_normal((n, 2, 1)))[..., 0]
+        spots = exact + noise + common @ rng.standard_normal(self.MODES)
+        return frame, true, spots, np.linalg.inv(np.linalg.cholesky(covariances)), common
+
+    def solved(self, frame: Frame, start: Pose, spots: Array, whitening: Array, common: Array | None) -> Refined:
+        used = np.ones((1, len(frame)), dtype=bool)
+        shared = None if common is None else common[None]
+        rotations, translations = start.rotation[None], start.translation[None]
+        return refine(frame, rotations, translations, spots[None], used, whitening[None], 100, shared)
+
+    def residual(self, given: Array, frame: Frame, pose: Pose, spots: Array, whitening: Array, common: Array) -> Array:
+        """Whitened residuals and the errors themselves, at a perturbation (6,) of the pose and errors (k,)."""
+        moved = pose.perturbed(given[:3], given[3:6])
+        rest = spots - common @ given[6:] - cut(frame, moved.rotation, moved.translation).points_mm
+        return np.append((whitening @ rest[..., None]).ravel(), given[6:])
+
+    @pytest.mark.parametrize("n", [4, 5, 8])
+    def test_joint_least_squares_has_the_same_optimum_and_information(self, n: int) -> None:
+        for seed in range(4):
+            frame, true, spots, whitening, common = self.drawn(40 + seed, n)
+            found = self.solved(frame, true, spots, whitening, common)
+            assert found.converged[0]
+            arguments = (frame, true, spots, whitening, common)
+            joint = least_squares(
+                self.residual,
+                np.zeros(6 + self.MODES),
+                args=arguments,
+                xtol=1e-14,
+                ftol=1e-14,
+                gtol=1e-14,
+                x_scale="jac",
+            )
+            pose = true.perturbed(joint.x[:3], joint.x[3:6])
+            assert found.chi_square[0] == pytest.approx(2 * joint.cost, rel=1e-6)
+            np.testing.assert_allclose(found.translations[0], pose.translation, atol=5e-4)
+            np.testing.assert_allclose(found.rotations[0], pose.rotation, atol=2e-5)
+            # The Jacobian by finite differences, and of its square what is left of the pose: Schur's complement.
+            here = (frame, Pose(found.rotations[0], found.translations[0]), spots, whitening, common)
+            steps = 1e-5 * np.diag([*[1.0] * 3, *[0.02] * 3, *[1.0] * self.MODES])
+            at = np.append(np.zeros(6), joint.x[6:])
+            columns = [self.residual(at + step, *here) - self.residual(at - step, *here) for step in steps]
+            jacobian = np.stack(columns, axis=1) / (2 * np.diag(steps))
+            square = jacobian.T @ jacobian
+            schur = square[:6, :6] - square[:6, 6:] @ np.linalg.solve(square[6:, 6:], square[6:, :6])
+            size = np.sqrt(np.diag(schur))
+            np.testing.assert_allclose(
+                found.information[0] / np.outer(size, size), schur / np.outer(size, size), atol=1e-6
+            )
+
+    def test_none_of_no_size_change_nothing(self) -> None:
+        frame, true, spots, whitening, common = self.drawn(50, 6)
+        without = self.solved(frame, true, spots, whitening, None)
+        nothing = self.solved(frame, true, spots, whitening, 0 * common)
+        assert nothing.chi_square[0] == pytest.approx(without.chi_square[0], rel=1e-12)
+        np.testing.assert_allclose(nothing.information, without.information, rtol=1e-9)
+        with_them = self.solved(frame, true, spots, whitening, common)
+        assert with_them.chi_square[0] < 0.9 * without.chi_square[0]
+
+    def test_those_of_unused_rods_do_not_count(self) -> None:
+        frame, true, spots, whitening, common = self.drawn(51, 7)
+        used = np.array([[True, True, False, True, True, True, True]])
+        found = []
+        for wild in (0.0, np.nan, 1e6):
+            shared = np.where(used[0][:, None, None], common, wild)
+            one = refine(
+                frame,
+                true.rotation[None],
+                true.translation[None],
+                spots[None],
+                used,
+                whitening[None],
+                100,
+                shared[None],
+            )
+            found.append(one)
+        for other in found[1:]:
+            assert other.chi_square[0] == found[0].chi_square[0]
+            np.testing.assert_array_equal(other.information, found[0].information)
+
+    def test_many_at_once_are_one_by_one(self) -> None:
+        """Poses come to rest at different times; each has shared errors of its own."""
+        frame, true, spots, whitening, common = self.drawn(52, 6)
+        rng = np.random.default_rng(1)
+        sizes = np.array([0.0, 0.1, 1.0, 3.0, 10.0])
+        shared = sizes[:, None, None, None] * common
+        starts = [true.perturbed(size * rng.normal(0, 0.3, 3), rng.normal(0, 0.02, 3)) for size in sizes]
+        together = refine(
+            frame,
+            np.stack([start.rotation for start in starts]),
+            np.stack([start.translation for start in starts]),
+            np.tile(spots, (5, 1, 1)),
+            np.ones((5, 6), dtype=bool),
+            np.tile(whitening, (5, 1, 1, 1)),
+            100,
+            shared,
+        )
+        for row, start in enumerate(starts):
+            alone = self.solved(frame, start, spots, whitening, shared[row])
+            assert together.chi_square[row] == pytest.approx(alone.chi_square[0], rel=1e-8)
+            np.testing.assert_allclose(together.translations[row], alone.translations[0], atol=1e-6)
+
+    def test_errors_are_as_large_as_the_information_says(self) -> None:
+        count, n = 1000, 6
+        frame, true, exact = scene(53, n)
+        rng = np.random.default_rng(5)
+        common = rng.normal(0, 0.3, (n, 2, self.MODES))
+        spots = (
+            exact + rng.normal(0, 0.1, (count, n, 2)) + np.einsum("nik,mk->mni", common, rng.normal(size=(count, 3)))
+        )
+        rotations, translations = np.tile(true.rotation, (count, 1, 1)), np.tile(true.translation, (count, 1))
+        used, shared = np.ones((count, n), dtype=bool), np.tile(common, (count, 1, 1, 1))
+        found = refine(frame, rotations, translations, spots, used, np.eye(2) / 0.1, 100, shared)
+        errors = pose_errors(found, true)
+        squared = np.einsum("mi,mij,mj->m", errors, found.information, errors)
+        assert squared.mean() == pytest.approx(6, abs=3.29 * np.sqrt(12 / count))
+        assert found.chi_square.mean() == pytest.approx(6, abs=3.29 * np.sqrt(12 / count))
+        untold = refine(frame, rotations, translations, spots, used, np.eye(2) / 0.1, 100)
+        wrong = np.einsum("mi,mij,mj->m", pose_errors(untold, true), untold.information, pose_errors(untold, true))
+        assert wrong.mean() > 20
+
+
 class TestSingular:
     def test_three_parallel_rods(self) -> None:
         n = 5

@@ -11,6 +11,7 @@ from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.matching import three_line
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_pose, random_spot_set
 
 SCANNER = ScannerSettings()
@@ -139,7 +140,7 @@ def test_twins_of_what_is_known_are_sought_even_where_chance_is_not_ruled_out() 
     truth = random_pose(np.random.default_rng(9), frame, SCANNER, max_tilt_deg=4.0, max_offset_mm=10.0)
     spots_px, _ = project(frame, truth, SCALE)
     mm = SCALE.to_mm(spots_px)
-    spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2)
+    spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2, Tolerances.none(frame))
     prior = Prior(np.eye(3), np.pi)
     every = three_line.match(spots, frame, prior, RegistrationOptions()).hypotheses
     assert len(every) == 2

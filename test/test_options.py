@@ -115,9 +115,17 @@ def test_target_becomes_a_tuple_of_plain_numbers() -> None:
     assert hash(options) == hash(RegistrationOptions(target_in_frame_mm=(1, -2, 3.5)))
 
 
-def test_no_limit_on_the_target_error_by_default() -> None:
-    (entry,) = (entry for entry in fields(RegistrationOptions) if entry.name == "max_target_error_mm")
-    assert entry.default == entry.metadata["high"]
+def test_what_is_taken_to_be_off_by_default() -> None:
+    """And how weak a pose may be: a controller that reads nothing but poses must not get weak ones."""
+    options = RegistrationOptions()
+    assert options.frame_tolerance_mm == 0.2
+    assert options.scale_tolerance == 0.002
+    assert options.max_target_error_mm == 3.0
+
+
+def test_a_frame_and_a_scale_may_be_perfect() -> None:
+    options = RegistrationOptions(frame_tolerance_mm=0.0, scale_tolerance=0.0)
+    assert options.frame_tolerance_mm == options.scale_tolerance == 0.0
 
 
 def test_cannot_be_changed() -> None:

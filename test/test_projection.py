@@ -14,6 +14,7 @@ from stereoreg_ros.geometry.projection import (
     point_line_distances,
     project,
     projection_jacobian,
+    rod_covariances,
 )
 from stereoreg_ros.geometry.slice import PixelScale
 
@@ -133,6 +134,46 @@ class TestJacobians:
             ahead, _ = project(frame, pose, PixelScale(*(values + step)))
             behind, _ = project(frame, pose, PixelScale(*(values - step)))
             np.testing.assert_allclose(by_scale[..., k], (ahead - behind) / 2e-6, rtol=1e-6, atol=1e-5)
+
+
+class TestRodCovariances:
+    @pytest.mark.parametrize("tilt_deg", [10.0, 45.0])
+    def test_are_those_of_rods_with_their_ends_off(self, tilt_deg: float) -> None:
+        """Of cuts along the whole length of rods, near their ends and in their middles."""
+        rng = np.random.default_rng(21)
+        frame = random_frame(rng, 6)
+        tolerances = np.array([0.05, 0.1, 0.2, 0.3, 0.1, 0.2])
+        count = 20_000
+        for height in (-25.0, 0.0, 28.0):
+            tilt = rotation_exp(np.radians(tilt_deg) * np.array([0.6, -0.8, 0.0]))
+            pose = Pose(tilt, np.array([5.0, -7.0, height]))
+            cuts = cut(frame, pose.rotation, pose.translation)
+            stated = rod_covariances(frame, tolerances, cuts)
+            off = rng.normal(size=(2, count, 6, 3)) * tolerances[:, None]
+            starts, ends = pose @ (frame.starts + off[0]).reshape(-1, 3), pose @ (frame.ends + off[1]).reshape(-1, 3)
+            share = (-starts[:, 2] / (ends - starts)[:, 2])[:, None]
+            points = (starts + share * (ends - starts))[:, :2].reshape(count, 6, 2) - cuts.points_mm
+            sample = np.einsum("mni,mnj->nij", points, points) / count
+            whitening = np.linalg.inv(np.linalg.cholesky(stated))
+            unit = whitening @ sample @ np.swapaxes(whitening, 1, 2)
+            # Beyond chance only by the second order of a rod that turns.
+            np.testing.assert_allclose(unit, np.tile(np.eye(2), (6, 1, 1)), atol=4.5 * np.sqrt(2 / count) + 0.005)
+
+    def test_middle_of_an_upright_rod(self) -> None:
+        cuts = cut(UPRIGHT, np.eye(3), np.zeros(3))
+        found = rod_covariances(UPRIGHT, np.array([0.2, 0.4, 0.1]), cuts)
+        np.testing.assert_allclose(found[0], 0.5 * 0.2**2 * np.eye(2))
+        assert np.isnan(found[2]).all()
+
+    def test_batch_is_a_loop(self) -> None:
+        rng = np.random.default_rng(22)
+        frame = random_frame(rng, 4)
+        rotations, translations = rotation_exp(rng.normal(0, 0.3, (5, 3))), rng.normal(0, 10, (5, 3))
+        together = rod_covariances(frame, np.full(4, 0.2), cut(frame, rotations, translations))
+        assert together.shape == (5, 4, 2, 2)
+        for row in range(5):
+            alone = cut(frame, rotations[row], translations[row])
+            np.testing.assert_allclose(together[row], rod_covariances(frame, np.full(4, 0.2), alone), rtol=1e-9)
 
 
 class TestDistances:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from real_images import CATPHAN_OPTIONS, catphan, height, shows_module
+from real_images import CATPHAN_OPTIONS, catphan, height, row_of, shows_module
 from scipy.stats import chi2
 
 from stereoreg_ros import load_frame, register_slice
@@ -80,50 +80,71 @@ def test_centres_of_each_wire_lie_on_a_straight_line(scan):
         assert rms <= 0.10
 
 
+def inner_slices(scan):
+    """The slices through which the wires run from side to side: all that show the module but the first and the last."""
+    return [one for one in scan if shows_module(one)][1:-1]
+
+
 def test_slices_that_show_the_module_are_accepted_and_step_with_the_table(scan, frame):
     found = {}
-    for one in filter(shows_module, scan):
+    for one in inner_slices(scan):
         result = register_slice(replace(one.ct_slice, scanner_from_slice=Pose.identity()), frame, CATPHAN_OPTIONS)
         assert result, f"z = {height(one):.1f}: {result.message}"
         assert result.estimate.inliers == 5
         found[height(one)] = (-result.scanner_from_frame.translation[2], is_training(one))
-    assert len(found) == 9
+    assert len(found) == 7
     table = np.array(sorted(found))
     recovered = np.array([found[z][0] for z in table])
-    steps = np.diff(recovered)
     judged = np.array([not found[z][1] for z in table])
-    # In the first and the last slice the wires end within the slice's thickness: half a streak is centred elsewhere.
-    whole = np.ones(len(table), dtype=bool)
-    whole[[0, -1]] = False
-    inner = np.diff(recovered[whole])
-    off = (recovered - table)[whole & judged]
+    steps = np.diff(recovered)
+    off = (recovered - table)[judged]
     print(f"steps {np.round(steps, 3).tolist()}: mean {steps.mean():.3f}, spread {steps.std():.3f} mm")
-    print(f"without the slices in which the wires end: mean {inner.mean():.3f}, spread {inner.std():.3f} mm")
     print(f"table position on the {len(off)} slices not used for the wires: spread {off.std():.3f} mm")
-    assert (whole & judged).sum() == 4
-    assert abs(inner.mean() - 2.5) <= 0.05
-    assert inner.std() <= 0.15
+    assert judged.sum() == 4
+    assert abs(steps.mean() - 2.5) <= 0.05
+    assert steps.std() <= 0.15
     assert off.std() <= 0.15
-    assert steps.std() <= 0.2
 
 
-def test_heights_spread_as_stated(scan, frame):
-    """Chi-square of the heights less the table's, in terms of their stated variances, between its 1 and 99 % points.
-
-    Over the slices through which the wires run from side to side: where they end within a slice, spots are a millimetre
-    off, which no covariance knows.
-    """
+def heights_chi_square(scan, frame, options):
+    """Chi-square of the inner slices' heights less the table's, by their stated variances; its degrees of freedom."""
     off, variances = [], []
-    for one in [one for one in scan if shows_module(one)][1:-1]:
-        result = register_slice(replace(one.ct_slice, scanner_from_slice=Pose.identity()), frame, CATPHAN_OPTIONS)
+    for one in inner_slices(scan):
+        result = register_slice(replace(one.ct_slice, scanner_from_slice=Pose.identity()), frame, options)
         assert result
         off.append(-result.scanner_from_frame.translation[2] - height(one))
         variances.append(result.covariance[2, 2])
     away = np.array(off) - np.average(off, weights=1 / np.array(variances))
     chi_square = float((away**2 / variances).sum())
     print(f"chi-square {chi_square:.2f} of {len(off) - 1} degrees of freedom")
-    low, high = chi2.ppf([0.01, 0.99], len(off) - 1)
+    return chi_square, len(off) - 1
+
+
+def test_heights_spread_as_stated(scan, frame):
+    """Between the 1 and 99 % points, where frame and scale are taken to be exact: they were measured on this scan."""
+    exact = replace(frame, tolerances_mm=np.zeros(len(frame)))
+    chi_square, freedom = heights_chi_square(scan, exact, replace(CATPHAN_OPTIONS, scale_tolerance=0.0))
+    low, high = chi2.ppf([0.01, 0.99], freedom)
     assert low < chi_square < high
+
+
+def test_heights_spread_no_more_than_stated_with_the_shipped_tolerance(scan, frame):
+    chi_square, freedom = heights_chi_square(scan, frame, CATPHAN_OPTIONS)
+    assert chi_square < chi2.ppf(0.99, freedom)
+
+
+@pytest.mark.parametrize("threshold", ["300", "auto"])
+def test_end_slices_are_within_their_stated_errors_or_refused(scan, threshold):
+    """There the wires end within the slice's thickness, which makes their spots a millimetre off."""
+    figures = row_of(f"catphan pylinac/{threshold}/prior/end")
+    assert len(figures.attempts) == 2
+    assert not figures.missed
+
+
+@pytest.mark.parametrize("threshold", ["300", "auto"])
+def test_without_prior_none_is_wrong(scan, threshold):
+    figures = row_of(f"catphan pylinac/{threshold}/no prior/module")
+    assert not figures.missed
 
 
 def test_slices_without_the_module_are_refused(scan, frame):

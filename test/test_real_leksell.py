@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from real_images import LEKSELL_OPTIONS, leksell
 
-from stereoreg_ros import load_frame, register_slice
+from stereoreg_ros import RegistrationOptions, load_frame, register_slice
 from stereoreg_ros.geometry.pose import rotation_angle
 from stereoreg_ros.spots import find_spots
 
@@ -51,6 +51,18 @@ def test_with_prior_is_accepted(ct_slice, frame, threshold):
     np.testing.assert_allclose(found, RODS_PX, atol=0.5)
     # The slice is nearly at right angles to the upright rods: the tilt is known only weakly, and that is said.
     assert result.estimate.rotation_std_deg >= 0.5
+
+
+def test_a_tilt_this_weak_is_refused_by_default_and_the_sentence_says_how_to_allow_it(ct_slice, frame):
+    allowed = RegistrationOptions().max_target_error_mm
+    result = register_slice(ct_slice, frame, replace(LEKSELL_OPTIONS, max_target_error_mm=allowed))
+    assert not result
+    assert result.reason == "inaccurate"
+    assert result.estimates[0].inliers == 6
+    stated = result.estimates[0].target_error_95_mm([0.0, 0.0, 0.0])
+    assert stated > allowed
+    assert f"{stated:.2f} mm" in result.message
+    assert "raise max_target_error_mm" in result.message
 
 
 def test_auto_offers_the_six_rods_and_hardly_more(ct_slice):

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from real_images import ZFRAME_OPTIONS, height, zframe
+from real_images import ZFRAME_OPTIONS, height, row_of, zframe
 from scipy.stats import chi2
 
+from benchmarks.real_scenes import SHARED_DATA, ZFRAME_THICKNESS_MM, erased, turned_orientations, zframe_rest
 from stereoreg_ros import load_frame, register_slice
-from stereoreg_ros.geometry.pose import Pose
+from stereoreg_ros.geometry.pose import Pose, rotation_from_quaternion
+from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.spots import find_spots
 
 FULL = range(6, 12)  # the slices that show all seven tubes
@@ -88,3 +90,63 @@ def test_slices_without_the_frame_are_refused(volume, frame, threshold):
         if number not in range(5, 12):
             result = register_slice(one.ct_slice, frame, replace(ZFRAME_OPTIONS, threshold=threshold))
             assert not result
+
+
+@THRESHOLDS
+def test_with_the_thickness_given_it_is_as_good_as_without(threshold):
+    """The tubes are 7.5 mm thick: what a leaning one shows is longer than the slice's thickness has it."""
+    named = f"{threshold:g}" if isinstance(threshold, float) else threshold
+    without, given = (row_of(f"zframe/{named}/full{what}") for what in ("", ", thickness given"))
+    assert not without.missed
+    assert not given.missed
+    assert [one.rods for one in given.attempts] == [7] * len(FULL)
+    np.testing.assert_allclose(
+        [one.error_mm for one in given.attempts], [one.error_mm for one in without.attempts], atol=0.15
+    )
+
+
+@pytest.mark.parametrize("given", ["", ", thickness given"])
+def test_slices_beside_the_whole_frame_are_within_their_stated_errors_or_refused(given):
+    """In slice 5 diagonal tubes end."""
+    figures = row_of(f"zframe/200/partly{given}")
+    assert len(figures.attempts) == 2
+    assert not figures.missed
+
+
+def test_erased_tubes_leave_no_spot_and_the_others_as_they_were(volume, frame):
+    rest = zframe_rest(SHARED_DATA / "zframe_mr")
+    for number in FULL:
+        ct_slice = volume[number].ct_slice
+        slice_from_frame = ct_slice.scanner_from_slice.inverse() @ rest
+        places = project(frame, slice_from_frame, ct_slice.scale)[0]
+        before = find_spots(ct_slice, ZFRAME_OPTIONS).centres_px
+        for line in range(len(frame)):
+            one = erased(ct_slice, frame, slice_from_frame, [line], ZFRAME_THICKNESS_MM)
+            after = find_spots(one, ZFRAME_OPTIONS).centres_px
+            assert np.linalg.norm(before - places[line], axis=1).min() < 2.0
+            assert np.linalg.norm(after - places[line], axis=1).min() > 10.0
+            assert len(after) == len(before) - 1
+
+
+@pytest.mark.parametrize("threshold", ["200", "auto"])
+@pytest.mark.parametrize(("count", "most"), [("1", 10), ("2", 10)])
+def test_with_tubes_erased_none_is_wrong(threshold, count, most):
+    figures = row_of(f"zframe/{threshold}/{count} erased", most)
+    assert len(figures.attempts) == most
+    assert not figures.missed
+
+
+def test_turned_orientations_are_far_from_how_it_stands(volume):
+    turns = turned_orientations()
+    assert len(turns) == 9
+    upright = zframe_rest(SHARED_DATA / "zframe_mr").rotation
+    for name, quaternion in turns.items():
+        turned = rotation_from_quaternion(quaternion)
+        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turned @ upright.T) - 1), -1, 1)))
+        assert angle > 80.0, name
+
+
+@pytest.mark.parametrize("threshold", ["200", "auto"])
+def test_told_a_wrong_orientation_none_is_wrong(threshold):
+    figures = row_of(f"zframe/{threshold}/turned", 10)
+    assert not figures.missed

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Vector3Stamped
+from rcl_interfaces.msg import ParameterType
 from ros_process import RosClient, node_process
 from std_srvs.srv import Trigger
-from test_register_node import SCALE, Bench, assert_near, image_of, rendered
+from test_register_node import CUBE, SCALE, SCANNER, Bench, assert_near, image_of, rendered
+from test_slice_spacing import OTHER, SpacedBench
+
+from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING
+from stereoreg_ros.simulation import PlacedFrame, random_pose, render_slice
 
 SLICES = [rendered(seed, noise_hu=5.0) for seed in range(40, 46)]
+LARGER = 1.03
 
 
 def arguments(namespace: str, spacing: tuple[float, float], *more: str) -> list[str]:
@@ -25,6 +34,30 @@ def clutter_of(rng: np.random.Generator) -> np.ndarray:
     for u, v in rng.integers(5, 250, (14, 2)):
         hu[v - 1 : v + 2, u - 1 : u + 2] = 3000
     return hu
+
+
+def of_a_larger_frame(seed: int) -> np.ndarray:
+    """A slice of a frame that is built 3 % larger than its file says."""
+    rng = np.random.default_rng(seed)
+    frame = replace(CUBE, starts=LARGER * CUBE.starts, ends=LARGER * CUBE.ends)
+    pose = random_pose(rng, frame, SCANNER, max_offset_mm=15.0)
+    return render_slice([PlacedFrame(frame, pose)], replace(SCANNER, noise_hu=5.0), rng).hu
+
+
+def wait_until_spacing_is_heard(bench: SpacedBench) -> None:
+    """Until the node is known to pair images with the spacing that comes with them."""
+
+    def heard() -> bool:
+        return str(bench.status(bench.send_spaced(SLICES[0][0], OTHER)).message).startswith(OTHER_SPACING)
+
+    bench.client.announce(f"{bench.namespace}/slice_spacing", Vector3Stamped)
+    bench.client.wait_for(heard, "the refusal of another spacing than was told")
+
+
+def forget_slices(bench: Bench) -> None:
+    """Have the node forget the slices that it was warmed up with."""
+    assert bench.set(pixel_spacing=[1.1 * SCALE.sx, SCALE.sy]) == ""
+    assert bench.set(pixel_spacing=[SCALE.sx, SCALE.sy]) == ""
 
 
 def wait_until_running(bench: Bench) -> None:
@@ -60,6 +93,60 @@ def test_from_a_wrong_spacing(client, factors):
             pose, values = bench.accept(image_of(hu))
             assert_near(pose, slice_from_frame)
             assert values["calibration"] == "measured"
+
+
+def test_spacing_that_came_with_the_slices_is_not_made_to_fit_the_frame(client):
+    """A frame 3 % larger than its file: either the scanner is off, or the file; the scanner hardly ever is."""
+    with node_process("register_node", *arguments("/stated", (SCALE.sx, SCALE.sy), "calibration_timeout:=0.0")):
+        bench = SpacedBench(client, "/stated", "/stated/image")
+        bench.warm_up(bench.diagnostics)
+        wait_until_spacing_is_heard(bench)
+        forget_slices(bench)
+        for seed in range(4):
+            bench.status(bench.send_spaced(of_a_larger_frame(seed), SCALE))
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        assert not response.success
+        assert "scanner, or frame file?" in response.message
+        assert "came with the slices is (0.5000, 0.6000) mm/pixel, measured is (0.48" in response.message
+        assert re.search(r"would have to be (2\.[5-9]|3\.[0-5]) % larger than its file says", response.message)
+        assert "cannot be told apart" in response.message
+        assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == [SCALE.sx, SCALE.sy]
+
+        # On purpose it may be changed; the slices are still there.
+        assert bench.set(calibration_max_change=0.15) == ""
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        assert response.success, response.message
+        assert "cannot be told apart" in response.message
+        (measured,) = client.get_parameters(bench.node, "pixel_spacing")
+        np.testing.assert_allclose(measured, [SCALE.sx / LARGER, SCALE.sy / LARGER], rtol=5e-3)
+
+
+def test_spacing_that_was_typed_in_is(client):
+    """The same slices without their spacing."""
+    with node_process("register_node", *arguments("/typed", (SCALE.sx, SCALE.sy))):
+        bench = Bench(client, "/typed", "/typed/image")
+        bench.warm_up(bench.diagnostics)
+        forget_slices(bench)
+        for seed in range(4):
+            bench.status(bench.send(image_of(of_a_larger_frame(seed))))
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        assert response.success, response.message
+        assert "cannot be told apart" in response.message
+        assert re.search(r"would have to be (2\.[5-9]|3\.[0-5]) % larger than its file says", response.message)
+
+
+def test_the_largest_change_is_a_number_or_left_to_the_node(client):
+    with node_process("register_node", *arguments("/limit", (SCALE.sx, SCALE.sy), "calibration_max_change:=0.03")):
+        bench = Bench(client, "/limit", "/limit/image")
+        assert client.get_parameters(bench.node, "calibration_max_change") == [0.03]
+        assert bench.set(calibration_max_change="auto") == ""
+        assert client.get_parameters(bench.node, "calibration_max_change") == ["auto"]
+        assert "expected a number from 0.001 to 0.5, or 'auto'" in bench.set(calibration_max_change="any")
+        assert "out of range Min: 0.001, Max: 0.5" in bench.set(calibration_max_change=0.9)
+        (descriptor,) = client.describe_parameters(bench.node, "calibration_max_change")
+        assert descriptor.type == ParameterType.PARAMETER_STRING
+        assert descriptor.dynamic_typing
+        assert "came with the slices" in descriptor.description
 
 
 def test_slices_are_registered_meanwhile_and_a_second_call_is_refused(client):

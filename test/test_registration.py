@@ -13,14 +13,15 @@ from scipy.stats import chi2, kstest
 from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_slice, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import rotation_angle
-from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.projection import cut, cut_jacobian, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.registration import MAX_SPOTS
+from stereoreg_ros.judgement import MAX_SPOTS
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, centred_pose, random_pose, random_spot_set
-from stereoreg_ros.uncertainty import in_scanner_axes, scale_sensitivity
 
 SCANNER = ScannerSettings()
 SCALE = SCANNER.scale
+# Of a frame as its file has it, in slices as large as they say.
+PERFECT = RegistrationOptions(frame_tolerance_mm=0.0, scale_tolerance=0.0)
 
 
 def is_wrong(found: Pose, truth: Pose, mm: float = 1.5, degrees: float = 2.0) -> bool:
@@ -72,7 +73,7 @@ def test_false_spots_and_missing_rods(cube, visible, false_spots, noise_px, leas
     trials, accepted = 100, 0
     for _ in range(trials):
         problem = random_spot_set(rng, cube, settings)
-        result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=0.3))
+        result = register_spots(problem.spots_px, cube, SCALE, replace(PERFECT, spot_noise_px=0.3))
         if result:
             accepted += 1
             # The pose may be off by what its own covariance says, which few rods make large; not by more.
@@ -232,7 +233,7 @@ class TestRefusals:
         reasons = []
         for _ in range(30):
             problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.5))
-            result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=0.08))
+            result = register_spots(problem.spots_px, cube, SCALE, replace(PERFECT, spot_noise_px=0.08))
             reasons.append("accepted" if result else result.reason)
             if result:
                 assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame, 2.0, 3.0)
@@ -325,7 +326,9 @@ class TestPlausibility:
         outcomes: list[str] = []
         for _ in range(trials):
             problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.2, gaussian=True))
-            result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=told_px))
+            result = register_spots(
+                problem.spots_px, cube, SCALE, replace(PERFECT, spot_noise_px=told_px, max_rotation_deg=60.0)
+            )
             if not result:
                 outcomes.append("implausible" if "cannot come from" in result.message else result.reason)
             else:
@@ -350,7 +353,7 @@ class TestPlausibility:
         values = []
         for _ in range(300):
             problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.2, gaussian=True))
-            result = register_spots(problem.spots_px, cube, SCALE, RegistrationOptions(spot_noise_px=0.2))
+            result = register_spots(problem.spots_px, cube, SCALE, replace(PERFECT, spot_noise_px=0.2))
             assert result
             assert result.estimate.degrees_of_freedom == 6
             values.append(result.estimate.chi_square)
@@ -363,25 +366,33 @@ class TestScaleCovariance:
         plane = Pose(Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix(), np.array([5.0, 6.0, 7.0]))
         spots, _ = project(cube, truth, SCALE)
         covariance = 1e-6 * np.array([[1.0, 0.3, 0.1], [0.3, 2.0, 0.0], [0.1, 0.0, 0.5]])
-        plain = register_spots(spots, cube, SCALE, scanner_from_slice=plane)
-        wide = register_spots(spots, cube, SCALE, scanner_from_slice=plane, scale_covariance=covariance)
+        plain = register_spots(spots, cube, SCALE, PERFECT, plane)
+        wide = register_spots(spots, cube, SCALE, PERFECT, plane, scale_covariance=covariance)
         assert plain
         assert wide
-        lines = np.array([match.line_index for match in wide.matches])
-        seen = np.array([match.spot_px for match in wide.matches])
-        noise = np.tile(0.09 * np.eye(2), (len(lines), 1, 1))
-        by_scale = scale_sensitivity(cube, lines, wide.estimate.slice_from_frame, seen, noise, SCALE)
-        added = in_scanner_axes(by_scale @ covariance @ by_scale.T, plane)
+        pose = wide.estimate.slice_from_frame
+        jacobian = cut_jacobian(cut(cube, pose.rotation, pose.translation), pose.translation).reshape(-1, 6)
+        # By how much the spots move that are shown at the wrong distance from the scanner's origin.
+        off = np.linalg.solve(SCALE.matrix, (SCALE.to_mm(spots) - plane.inverse().translation[:2]).T).T
+        moved = np.zeros((6, 2, 3))
+        moved[:, 0, 0], moved[:, 1, 1], moved[:, 0, 2] = off[:, 0], off[:, 1], off[:, 1]
+        by_scale = moved.reshape(-1, 3)
+        # The spots are weighed by all that makes them uncertain, but for what moves them all alike.
+        apart = (moved - moved.mean(axis=0)).reshape(-1, 3)
+        weights = np.linalg.inv((0.3 * 0.5) ** 2 * np.eye(12) + apart @ covariance @ apart.T)
+        follows = np.linalg.solve(jacobian.T @ weights @ jacobian, jacobian.T @ weights)
+        expected = follows @ ((0.3 * 0.5) ** 2 * np.eye(12) + by_scale @ covariance @ by_scale.T) @ follows.T
+        turned = np.kron(np.eye(2), plane.rotation)
         assert wide.estimate.position_std_mm > 1.2 * plain.estimate.position_std_mm
-        np.testing.assert_allclose(wide.covariance, plain.covariance + added, atol=1e-12)
-        nothing = register_spots(spots, cube, SCALE, scanner_from_slice=plane, scale_covariance=np.zeros((2, 2)))
+        np.testing.assert_allclose(wide.covariance, turned @ expected @ turned.T, rtol=1e-6, atol=1e-9)
+        nothing = register_spots(spots, cube, SCALE, PERFECT, plane, scale_covariance=np.zeros((2, 2)))
         assert nothing
         np.testing.assert_allclose(nothing.covariance, plain.covariance, atol=1e-15)
 
     def test_counts_in_what_is_refused(self, cube):
         truth = random_pose(np.random.default_rng(24), cube, SCANNER)
         spots, _ = project(cube, truth, SCALE)
-        options = RegistrationOptions(max_position_std_mm=1.0)
+        options = replace(PERFECT, max_position_std_mm=1.0)
         assert register_spots(spots, cube, SCALE, options)
         result = register_spots(spots, cube, SCALE, options, scale_covariance=0.01**2 * np.eye(2))
         assert not result

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from frames import random_frame, random_slice_from_frame
@@ -20,7 +22,9 @@ from stereoreg_ros.solvers.calibration import (
     calibrate_newton_raphson,
     calibration_covariance,
 )
+from stereoreg_ros.solvers.joint_calibration import JointScale, calibrate_jointly
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION
+from stereoreg_ros.solvers.tolerant_calibration import TolerantScale, calibrate_tolerantly
 
 SCALE = PixelScale(0.48, 0.52)
 SHEARED = PixelScale(0.48, 0.52, 0.03)
@@ -257,6 +261,153 @@ class TestMaximumLikelihood:
         assert squared.mean() == pytest.approx(8, abs=3.29 * np.sqrt(16 / count))
         ratio = (errors**2).mean(axis=0) / np.diag(covariance)
         np.testing.assert_allclose(ratio, 1, atol=4.5 * np.sqrt(2 / count))
+
+
+class Series:
+    """Slices of a frame whose rods are not quite where `frame` has them, for the solvers that take several slices.
+
+    poses: the true slice_from_frame; spots_px (m, n, 2); used (m, n); as_built: the rods as they truly are.
+    """
+
+    NOISE_PX = 0.25
+
+    def __init__(
+        self, rng: np.random.Generator, frame: Frame, slices: int, tolerances_mm: Array, scale: PixelScale = SCALE
+    ) -> None:
+        def off(points: Array) -> Array:
+            return np.asarray(points + tolerances_mm[:, None] * rng.standard_normal(points.shape))
+
+        self.frame, self.tolerances_mm, self.scale = frame, tolerances_mm, scale
+        self.as_built = replace(frame, starts=off(frame.starts), ends=off(frame.ends))
+        self.poses = [random_slice_from_frame(rng, frame) for _ in range(slices)]
+        exact = np.array([project(self.as_built, pose, scale)[0] for pose in self.poses])
+        self.spots_px = exact + rng.normal(0, self.NOISE_PX, exact.shape)
+        self.used = np.ones(exact.shape[:2], dtype=bool)
+        self.covariances_px2 = np.tile(self.NOISE_PX**2 * np.eye(2), (*self.used.shape, 1, 1))
+        self._rotations = np.array([pose.rotation for pose in self.poses])
+        self._translations = np.array([pose.translation for pose in self.poses])
+
+    def exact_frame(self, with_shear: bool = False) -> JointScale:
+        """The scale as if the rods were where the frame has them."""
+        return calibrate_jointly(
+            self.frame,
+            self._rotations,
+            self._translations,
+            self.spots_px,
+            self.used,
+            self.covariances_px2,
+            self.scale,
+            with_shear,
+        )
+
+    def tolerant(self, measured: int = 2) -> TolerantScale:
+        """The scale with the rods' tolerances."""
+        start = self.exact_frame(measured == 3)
+        found = calibrate_tolerantly(
+            self.frame,
+            self.tolerances_mm,
+            start.rotations,
+            start.translations,
+            self.spots_px,
+            self.used,
+            self.covariances_px2,
+            start.scale if measured else self.scale,
+            measured,
+        )
+        assert found.converged
+        return found
+
+
+class TestToleranceOfTheFrame:
+    """Rods that are off by the same in every slice."""
+
+    @pytest.mark.parametrize("measured", [2, 3])
+    def test_of_an_exact_frame_all_is_as_without(self, measured: int) -> None:
+        series = Series(np.random.default_rng(70), EIGHT_RODS, 4, np.zeros(8))
+        with_none, tolerant = series.exact_frame(measured == 3), series.tolerant(measured)
+        for name in ("sx", "sy", "shear"):
+            assert getattr(tolerant.scale, name) == pytest.approx(getattr(with_none.scale, name), abs=1e-9)
+        np.testing.assert_allclose(tolerant.covariance, with_none.covariance, rtol=1e-6, atol=1e-15)
+        assert (tolerant.frame_covariance == 0).all()
+        np.testing.assert_allclose(tolerant.residuals_px, with_none.residuals_px, atol=1e-6)
+        assert tolerant.chi_square == pytest.approx(with_none.chi_square, rel=1e-9)
+        assert tolerant.degrees_of_freedom == with_none.degrees_of_freedom
+        np.testing.assert_array_equal(tolerant.frame.starts, EIGHT_RODS.starts)
+
+    @pytest.mark.parametrize("measured", [0, 2, 3])
+    def test_is_the_minimum_over_scale_poses_and_rods(self, measured: int) -> None:
+        rng = np.random.default_rng(71)
+        series = Series(rng, EIGHT_RODS, 3, rng.uniform(0.1, 0.4, 8), SHEARED if measured == 3 else SCALE)
+        found = series.tolerant(measured)
+
+        def cost(step: Array) -> float:
+            scale = PixelScale(*np.array([found.scale.sx, found.scale.sy, found.scale.shear]) + 1e-3 * step[:3])
+            ends = 0.1 * step[21:].reshape(2, 8, 3)
+            frame = replace(found.frame, starts=found.frame.starts + ends[0], ends=found.frame.ends + ends[1])
+            total = 0.0
+            for row, part in enumerate(step[3:21].reshape(3, 6)):
+                pose = Pose(found.rotations[row], found.translations[row]).perturbed(part[:3], part[3:] / 50)
+                total += float(((project(frame, pose, scale)[0] - series.spots_px[row]) ** 2).sum())
+            total /= series.NOISE_PX**2
+            for points, true in ((frame.starts, EIGHT_RODS.starts), (frame.ends, EIGHT_RODS.ends)):
+                total += float((((points - true) / series.tolerances_mm[:, None]) ** 2).sum())
+            return total
+
+        assert cost(np.zeros(69)) == pytest.approx(found.chi_square, rel=1e-9)
+        free = [row for row in range(69) if row < measured or row >= 3]
+        slope = [(cost(1e-3 * np.eye(69)[row]) - cost(-1e-3 * np.eye(69)[row])) / 2e-3 for row in free]
+        np.testing.assert_allclose(slope, 0, atol=2e-3)
+        assert found.degrees_of_freedom == 3 * 16 - 18 - measured
+
+    def test_covariance_is_the_inverse_of_the_whole_information(self) -> None:
+        """Held against one matrix of all unknowns, its derivatives by differences."""
+        rng = np.random.default_rng(72)
+        tolerances_mm = rng.uniform(0.1, 0.4, 8)
+        series = Series(rng, EIGHT_RODS, 3, tolerances_mm)
+        found = series.tolerant()
+
+        def predicted(step: Array) -> Array:
+            scale = PixelScale(found.scale.sx + step[0], found.scale.sy + step[1])
+            ends = tolerances_mm[None, :, None] * step[20:].reshape(2, 8, 3)
+            frame = replace(found.frame, starts=found.frame.starts + ends[0], ends=found.frame.ends + ends[1])
+            poses = [
+                Pose(found.rotations[row], found.translations[row]).perturbed(part[:3], part[3:])
+                for row, part in enumerate(step[2:20].reshape(3, 6))
+            ]
+            return np.concatenate([project(frame, pose, scale)[0].ravel() for pose in poses]) / series.NOISE_PX
+
+        steps = 1e-5 * np.eye(68)
+        jacobian = np.array([(predicted(step) - predicted(-step)) / 2e-5 for step in steps]).T
+        known = np.diag(np.repeat([0.0, 1.0], [20, 48]))
+        whole = np.linalg.inv(jacobian.T @ jacobian + known)
+        np.testing.assert_allclose(found.covariance, whole[:2, :2], rtol=1e-4)
+        np.testing.assert_allclose(found.frame_covariance, whole[:2, 20:] @ whole[20:, :2], rtol=1e-4)
+
+    @pytest.mark.parametrize("slices", [1, 8])
+    def test_errors_are_as_stated(self, slices: int) -> None:
+        """Limits at 99.9 %, two sides, for the seed as it is."""
+        rng, count = np.random.default_rng(73 + slices), 120
+        squared, chi_squares = np.empty(count), np.empty(count)
+        freedom = slices * 10 - 2
+        for row in range(count):
+            found = Series(rng, EIGHT_RODS, slices, np.full(8, 0.2)).tolerant()
+            error = np.array([found.scale.sx - SCALE.sx, found.scale.sy - SCALE.sy])
+            squared[row] = error @ np.linalg.solve(found.covariance, error)
+            chi_squares[row] = found.chi_square
+        assert squared.mean() == pytest.approx(2, abs=3.29 * np.sqrt(4 / count))
+        assert chi_squares.mean() == pytest.approx(freedom, abs=3.29 * np.sqrt(2 * freedom / count))
+
+    def test_more_slices_do_not_average_the_frame_away(self) -> None:
+        """Of 60 slices the noise is all but gone, and what 0.2 mm in 60 mm do stays: about 0.2 %."""
+        rng = np.random.default_rng(75)
+        few, many = (Series(rng, EIGHT_RODS, slices, np.full(8, 0.2)) for slices in (3, 60))
+        noise = [np.sqrt(one.exact_frame().covariance[0, 0]) / SCALE.sx for one in (few, many)]
+        stated = [np.sqrt(one.tolerant().covariance[0, 0]) / SCALE.sx for one in (few, many)]
+        of_frame = np.sqrt(many.tolerant().frame_covariance[0, 0]) / SCALE.sx
+        assert noise[1] < noise[0] / 3
+        assert noise[1] < 0.0005
+        assert 0.001 < of_frame < stated[1] < stated[0] < 0.005
+        assert of_frame > 0.9 * stated[1]
 
 
 class TestDegenerate:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice, register_spots
+from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.spots import Streaks
@@ -19,8 +20,15 @@ SCALE = PixelScale(0.5, 0.5)
 
 
 def leaning(degrees: float) -> Pose:
-    """slice_from_frame in which the first rod of the Leksell box, upright, leans along x."""
-    return Pose(rotation_exp(np.array([0.0, math.radians(degrees), 0.0])), np.zeros(3))
+    """slice_from_frame in which the first rod of the Leksell box, upright, leans along x and is cut in its middle."""
+    return cut_at(0.5, degrees)
+
+
+def cut_at(share: float, degrees: float) -> Pose:
+    """The same, cut at a share of that rod's length."""
+    frame = load_frame("leksell_ct")
+    rotation = rotation_exp(np.array([0.0, math.radians(degrees), 0.0]))
+    return Pose(rotation, -(rotation @ (frame.starts[0] + share * (frame.ends[0] - frame.starts[0]))))
 
 
 @pytest.mark.parametrize(
@@ -42,14 +50,45 @@ def test_a_leaning_rod_in_a_thick_slice_leaves_a_streak(
     frame, pose = load_frame("leksell_ct"), leaning(45.0)
     cuts = cut(frame, pose.rotation[None], pose.translation[None])
     streaks = Streaks(np.array([along_mm]), np.array([cut_short]), 5.0)
-    assert bool(streaks.allow(cuts)[0, 0, 0]) == allowed
+    assert bool(streaks.allow(frame, cuts)[0, 0, 0]) == allowed
 
 
 def test_an_upright_rod_leaves_none() -> None:
     frame, pose = load_frame("leksell_ct"), leaning(2.0)
     cuts = cut(frame, pose.rotation[None], pose.translation[None])
     streaks = Streaks(np.array([[0.4, 0.2], [6.0, 0.0]]), np.zeros(2, dtype=bool), 5.0)
-    assert streaks.allow(cuts)[0, 0].tolist() == [True, False]
+    assert streaks.allow(frame, cuts)[0, 0].tolist() == [True, False]
+
+
+def allowed_lengths(frame: Frame, pose: Pose, thickness_mm: float) -> list[float]:
+    """Of streaks along x, the shortest and the longest that the first rod may leave, mm."""
+    lengths = np.arange(0.0, 30.0, 0.05)
+    along = np.column_stack([lengths, np.zeros(len(lengths))])
+    streaks = Streaks(along, np.zeros(len(lengths), dtype=bool), thickness_mm)
+    allowed = lengths[streaks.allow(frame, cut(frame, pose.rotation[None], pose.translation[None]))[0, 0]]
+    return [float(allowed.min()), float(allowed.max())]
+
+
+def thick(diameter_mm: float) -> Frame:
+    frame = load_frame("leksell_ct")
+    return replace(frame, diameters=np.full(len(frame), diameter_mm))
+
+
+def test_a_thick_rod_leaves_a_longer_streak_and_never_has_to() -> None:
+    """A tube of 7.5 mm at 45 degrees was seen 6.9 mm long in a slice of 2.4 mm."""
+    pose = leaning(45.0)
+    thin, tube = allowed_lengths(thick(0.5), pose, 2.4), allowed_lengths(thick(7.5), pose, 2.4)
+    assert tube[0] == thin[0]
+    assert thin[1] < 6.9 < tube[1]
+    # Root of twelve times the second moment of a bright wall at this angle, and of the thickness, half as long again.
+    assert tube[1] == pytest.approx(1.5 * math.hypot(2.4, math.sqrt(1.5) * 7.5) + 1.5, abs=0.06)
+
+
+@pytest.mark.parametrize(("share", "is_whole"), [(0.5, True), (0.02, False), (0.98, False)])
+def test_a_rod_that_ends_within_the_slice_may_leave_a_shorter_streak(share: float, is_whole: bool) -> None:
+    shortest, longest = allowed_lengths(thick(1.0), cut_at(share, 45.0), 8.0)
+    assert (shortest > 2.0) == is_whole
+    assert longest == pytest.approx(allowed_lengths(thick(1.0), leaning(45.0), 8.0)[1])
 
 
 @pytest.mark.parametrize("threshold", [2000.0, "auto"])
@@ -97,7 +136,13 @@ def test_the_pose_is_as_sure_as_its_spots_are() -> None:
         truth = random_spot_set(rng, frame, SpotSetSettings(ScannerSettings(), 6, 0, 0.0))
         covariances = noisy(rng, 6)
         spots = truth.spots_px + np.einsum("nij,nj->ni", np.linalg.cholesky(covariances), rng.normal(size=(6, 2)))
-        options = RegistrationOptions(spot_noise_px=0.001, max_log10_false_alarms=0.0)
+        options = RegistrationOptions(
+            spot_noise_px=0.001,
+            frame_tolerance_mm=0.0,
+            scale_tolerance=0.0,
+            max_log10_false_alarms=0.0,
+            max_target_error_mm=1000.0,
+        )
         result = register_spots(spots, frame, SCALE, options, covariances_px2=covariances)
         if not result:
             continue
@@ -119,12 +164,14 @@ def small_turn(rotation: Array) -> Array:
 def test_a_spot_is_never_better_known_than_the_option_says() -> None:
     frame = load_frame("cube6")
     spots = random_spot_set(np.random.default_rng(12), frame, SpotSetSettings(ScannerSettings(), 6, 3, 0.3)).spots_px
-    plain = register_spots(spots, frame, SCALE)
-    told = register_spots(spots, frame, SCALE, covariances_px2=np.tile(0.01**2 * np.eye(2), (len(spots), 1, 1)))
+    perfect = RegistrationOptions(frame_tolerance_mm=0.0, scale_tolerance=0.0)
+    better, worse_px2 = (np.tile(std**2 * np.eye(2), (len(spots), 1, 1)) for std in (0.01, 0.6))
+    plain = register_spots(spots, frame, SCALE, perfect)
+    told = register_spots(spots, frame, SCALE, perfect, covariances_px2=better)
     assert plain
     assert told
     np.testing.assert_allclose(told.covariance, plain.covariance, rtol=1e-9)
-    worse = register_spots(spots, frame, SCALE, covariances_px2=np.tile(0.6**2 * np.eye(2), (len(spots), 1, 1)))
+    worse = register_spots(spots, frame, SCALE, perfect, covariances_px2=worse_px2)
     assert not worse or worse.estimate.position_std_mm == pytest.approx(2 * plain.estimate.position_std_mm, rel=0.01)
 
 

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from frames import random_frame, random_slice_from_frame
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from numpy.typing import NDArray
+from scipy.stats import chi2, kstest
 
-from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, rotation_exp
-from stereoreg_ros.geometry.projection import project
-from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.solvers.maximum_likelihood import refine
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.uncertainty import (
+    Whitened,
     checked_scale_covariance,
     error_ball_95,
     in_scanner_axes,
     point_covariance,
-    scale_sensitivity,
 )
 
 
@@ -147,47 +141,76 @@ def test_the_ball_is_within_0_3_percent_of_exact_over_every_covariance() -> None
     assert max(held) < 0.953
 
 
-class TestScaleSensitivity:
-    @pytest.mark.parametrize("shear", [0.0, 0.02])
-    def test_is_how_the_maximum_likelihood_pose_follows_the_scale(self, shear: float) -> None:
+def whitened(rng: np.random.Generator, rods: int, scales: int = 2, others: int = 1) -> Whitened:
+    """Residuals of so many rods with Jacobians drawn at random, at the pose at which they fit best."""
+    count, errors = 2 * rods, scales + others
+    by_pose, by_common = rng.normal(size=(count, 6)), 0.7 * rng.normal(size=(count, errors))
+    residual = rng.normal(size=count) + by_common @ rng.normal(size=errors)
+    joint = np.vstack([np.hstack([by_pose, by_common]), np.eye(6 + errors)[6:]])
+    best = np.linalg.lstsq(joint, np.append(residual, np.zeros(errors)), rcond=None)[0]
+    shifts = np.zeros((6, errors))
+    shifts[:2, :scales] = rng.normal(size=(2, scales))
+    return Whitened(by_pose, by_common, residual - by_pose @ best[:6], shifts, np.arange(errors) < scales)
+
+
+def chi_square(given: Whitened, free: NDArray[np.bool_]) -> float:
+    """Least sum of squares over the pose and the shared errors, of which those that are `free` may be of any size."""
+    errors = given.by_common.shape[1]
+    joint = np.vstack([np.hstack([given.by_pose, given.by_common]), np.eye(6 + errors)[6:][~free]])
+    wanted = np.append(given.residual, np.zeros((~free).sum()))
+    best = np.linalg.lstsq(joint, wanted, rcond=None)[0]
+    return float(((joint @ best - wanted) ** 2).sum())
+
+
+class TestWhitened:
+    def test_shifts_add_to_the_covariance_what_errors_that_move_all_spots_do(self) -> None:
+        """Of the errors of poses that weigh their spots by what is known of them, drawn at random."""
         rng = np.random.default_rng(6)
-        frame = random_frame(rng, 7)
-        lines = np.array([0, 2, 3, 4, 6])
-        truth = random_slice_from_frame(rng, frame)
-        scale = PixelScale(0.45, 0.6, shear)
-        spots = project(frame, truth, scale)[0][lines] + rng.normal(0, 0.02, (5, 2))
-        root = rng.normal(size=(5, 2, 2))
-        covariances = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(2)
+        given = whitened(rng, 6)
+        count = 400_000
+        errors = rng.standard_normal((count, 3))
+        residuals = rng.standard_normal((count, 12)) + errors @ given.by_common.T
+        weights = np.linalg.inv(np.eye(12) + given.by_common @ given.by_common.T)
+        information = given.by_pose.T @ weights @ given.by_pose
+        fitted = residuals @ np.linalg.solve(information, given.by_pose.T @ weights).T
+        off = fitted + errors @ given.shifts.T
+        stated = np.linalg.inv(information) + given.covariance_by_shifts()
+        whitening = np.linalg.inv(np.linalg.cholesky(stated))
+        sample = whitening @ (off.T @ off / count) @ whitening.T
+        np.testing.assert_allclose(sample, np.eye(6), atol=4.5 * np.sqrt(2 / count))
+        # Which the square of the shifts alone would not be.
+        assert np.abs(given.covariance_by_shifts() - given.shifts @ given.shifts.T).max() > 0.01
 
-        def pose_at(changed: PixelScale, start: Pose) -> Pose:
-            # The weights stay those of the told scale: that they follow it matters only where there are residuals.
-            spots_mm, used = np.zeros((1, 7, 2)), np.zeros((1, 7), dtype=bool)
-            whitening = np.tile(np.eye(2), (1, 7, 1, 1))
-            spots_mm[0, lines], used[0, lines] = changed.to_mm(spots), True
-            whitening[0, lines] = np.linalg.inv(np.linalg.cholesky(scale.matrix @ covariances @ scale.matrix.T))
-            found = refine(frame, start.rotation[None], start.translation[None], spots_mm, used, whitening, 100)
-            return Pose(nearest_rotation(found.rotations[0]), found.translations[0])
+    def test_without_shifts_nothing_is_added(self) -> None:
+        given = whitened(np.random.default_rng(7), 5)
+        assert not given._replace(shifts=np.zeros((6, 3))).covariance_by_shifts().any()
 
-        rest = pose_at(scale, truth)
-        stated = scale_sensitivity(frame, lines, rest, spots, covariances, scale)
-        step = 1e-4
-        for column, name in enumerate(("sx", "sy", "shear")):
-            more = pose_at(replace(scale, **{name: getattr(scale, name) + step}), rest)
-            less = pose_at(replace(scale, **{name: getattr(scale, name) - step}), rest)
-            turn = Rotation.from_matrix(more.rotation @ less.rotation.T).as_rotvec()
-            moved = np.concatenate([more.translation - less.translation, turn]) / (2 * step)
-            size = np.array([np.abs(stated[:3]).max()] * 3 + [np.abs(stated[3:]).max()] * 3)
-            np.testing.assert_allclose(moved / size, stated[:, column] / size, atol=5e-3, err_msg=name)
+    @pytest.mark.parametrize("rods", [5, 6, 9])
+    def test_scale_misfit_is_what_chi_square_falls_by(self, rods: int) -> None:
+        rng = np.random.default_rng(8)
+        for _ in range(20):
+            given = whitened(rng, rods)
+            fall = chi_square(given, np.zeros(3, dtype=bool)) - chi_square(given, given.scale)
+            assert given.scale_misfit() == pytest.approx(fall, rel=1e-7)
 
-    def test_a_shift_by_the_spacing_is_a_shift_of_the_pose(self) -> None:
-        """All spots in one place but for the frame's size: far from the pixels' origin, a scale is a shift."""
-        rng = np.random.default_rng(7)
-        frame = random_frame(rng, 6)
-        pose = Pose(np.eye(3), np.array([1e5, 0.0, 0.0]))
-        scale = PixelScale(0.5, 0.5)
-        spots = project(frame, pose, scale)[0]
-        stated = scale_sensitivity(frame, np.arange(6), pose, spots, np.tile(np.eye(2), (6, 1, 1)), scale)
-        assert stated[0, 0] == pytest.approx(2e5, rel=0.01)
+    @pytest.mark.parametrize("scales", [2, 3])
+    def test_scale_misfit_of_stated_errors_is_chi_square_distributed(self, scales: int) -> None:
+        rng = np.random.default_rng(9)
+        values = [whitened(rng, 7, scales).scale_misfit() for _ in range(1500)]
+        assert kstest(values, chi2(scales).cdf).pvalue > 1e-3
+
+    def test_a_scale_that_nothing_shows_is_not_judged(self) -> None:
+        """Three rods fit any scale: what they say of it is rounding."""
+        rng = np.random.default_rng(10)
+        values = [whitened(rng, 3).scale_misfit() for _ in range(50)]
+        assert max(values) < 1e-3
+
+    def test_a_scale_without_an_error_has_no_misfit(self) -> None:
+        given = whitened(np.random.default_rng(11), 6, scales=0, others=2)
+        assert given.scale_misfit() == 0.0
+        none = whitened(np.random.default_rng(12), 6, scales=0, others=0)
+        assert none.scale_misfit() == 0.0
+        assert none.covariance_by_shifts().shape == (6, 6)
 
 
 class TestScaleCovariance:

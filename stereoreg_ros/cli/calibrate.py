@@ -25,7 +25,7 @@ def add_to(commands: Commands) -> None:
         "calibrate",
         help="measure the pixel spacing from DICOM slices that show a frame",
         description="Measures the pixel spacing from all slices together, with a pose for each, and from each slice "
-        "alone, beside what the files say.",
+        "alone, beside what the files say. Scale and size of the frame cannot be told apart from slices.",
         allow_abbrev=False,
     )
     add_series_and_frame(calibrate)
@@ -87,6 +87,7 @@ def _series_record(series: SeriesScale) -> dict[str, Any]:
         "pixel_spacing": [found.scale.sx, found.scale.sy] if found else None,
         "pixel_shear": found.scale.shear if found else None,
         "standard_errors": list(found.standard_errors) if found else None,
+        "frame_errors": list(found.frame_errors) if found else None,
         "residual_before_px": found.residual_before_px if found else None,
         "residual_after_px": found.residual_after_px if found else None,
         "slices": [
@@ -105,7 +106,7 @@ def _series_record(series: SeriesScale) -> dict[str, Any]:
 def _print_series(series: SeriesScale) -> None:
     given = series.given
     print_line(
-        f"{'slice':{NAME_WIDTH}}  rods  linear sx, sy     Newton-Raphson sx, sy               beside the files' /%"
+        f"{'slice':{NAME_WIDTH}}  rods  linear sx, sy     Newton-Raphson sx, sy +- spot noise beside the files' /%"
     )
     for one in series.slices:
         found, (error_x, error_y) = one.newton_raphson, one.standard_errors

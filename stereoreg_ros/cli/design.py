@@ -6,6 +6,7 @@ import argparse
 import shlex
 import textwrap
 from pathlib import Path
+from typing import Final
 
 from tqdm import tqdm
 
@@ -30,6 +31,11 @@ from stereoreg_ros.geometry.frame_file import frame_text
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.whole_file import write_whole
+
+_AXES: Final = (
+    "Axes, right-handed: with nominal_orientation 0 0 0 1 x points to the patient's left, y to the back, z to the head "
+    "(DICOM's L, P, S) of a patient lying head first, supine."
+)
 
 
 def add_to(commands: Commands) -> None:
@@ -110,12 +116,11 @@ def _design(arguments: argparse.Namespace) -> int:
 
 
 def _wish(arguments: argparse.Namespace, options: RegistrationOptions) -> Wish:
-    scale = PixelScale(*arguments.pixel_spacing)
     envelope = Envelope(tuple(arguments.envelope), arguments.gap)
     return Wish(
         envelope,
         (arguments.diameter,) * arguments.lines,
-        Imaging(scale, options.spot_noise_px, options.slice_thickness_mm),
+        Imaging.of(PixelScale(*arguments.pixel_spacing), options),
         options.target_in_frame_mm,
         arguments.tilt,
         envelope.size_mm[2] / 4 if arguments.height is None else arguments.height,
@@ -150,5 +155,6 @@ def _comment(arguments: argparse.Namespace, proposal: Proposal) -> str:
         [
             f"{len(proposal.frame)} rods; {found}; {ending}. Made by",
             *textwrap.wrap(shlex.join(asked), 116, break_on_hyphens=False),
+            *textwrap.wrap(_AXES, 116),
         ]
     )

@@ -17,12 +17,15 @@ from stereoreg_ros.options import RegistrationOptions
 
 USED_OPTIONS: Final = (
     "spot_noise_px",
+    "frame_tolerance_mm",
+    "scale_tolerance",
     "slice_thickness_mm",
     "min_inliers",
     "max_log10_false_alarms",
     "nominal_orientation",
     "max_rotation_deg",
     "target_in_frame_mm",
+    "max_target_error_mm",
 )
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stereoreg_ros.design.meeting import Meetings
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import rotation_angle
+from stereoreg_ros.geometry.pose import Array, rotation_angle
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
@@ -45,12 +45,18 @@ def trials(
 ) -> Iterator[Trial]:
     """Register the frame from the spots of each pose, with the stated noise, for each choice of a rod left out.
 
-    The spots are taken to be all that a slice of 512 x 512 pixels shows.
+    In each pose the rods are another specimen's, within the tolerance, and the scale another scanner's. The spots are
+    taken to be all that a slice of 512 x 512 pixels shows.
     """
     area_mm2 = _PIXELS * scale.sx * scale.sy
+    tolerances_mm = frame.tolerances_or(options.frame_tolerance_mm)
+    specimens = rng.spawn(1)[0]
     for row in range(len(poses)):
         slice_from_frame = poses.pose(row)
-        spots_px, cuts = project(frame, slice_from_frame, scale)
+        built = _specimen(frame, tolerances_mm, specimens)
+        stretch_x, stretch_y = 1 + options.scale_tolerance * specimens.standard_normal(2)
+        taken = PixelScale(stretch_x * scale.sx, stretch_y * scale.sy, scale.shear)
+        spots_px, cuts = project(built, slice_from_frame, taken)
         for out in left_out:
             lines = np.flatnonzero(cuts.inside & (np.arange(len(frame)) != (-1 if out is None else out)))
             noisy = spots_px[lines] + options.spot_noise_px * rng.standard_normal((len(lines), 2))
@@ -71,6 +77,12 @@ def trials(
                     told = f"{','.join(names[0])} -> {','.join(names[1])}"
                     twins.append((told, angle, float(np.linalg.norm(moved))))
             yield Trial(out, "" if result else result.reason, right, tuple(twins))
+
+
+def _specimen(frame: Frame, tolerances_mm: Array, rng: np.random.Generator) -> Frame:
+    """The frame as it may have been built."""
+    off = tolerances_mm[:, None] * rng.standard_normal((2, len(frame), 3))
+    return replace(frame, starts=frame.starts + off[0], ends=frame.ends + off[1])
 
 
 def reasons(made: Sequence[Trial]) -> Counter[str]:

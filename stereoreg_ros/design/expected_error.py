@@ -13,8 +13,9 @@ from scipy.special import erf, gammainc
 from stereoreg_ros.design.layouts import Layouts
 from stereoreg_ros.design.meeting import Meetings
 from stereoreg_ros.geometry.pose import Array, skew
-from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
+from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian, rod_covariances
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.options import RegistrationOptions
 
 # Standard deviation of a scanner's point spread in the plane, mm: that of a usual body kernel, 1.1 mm wide.
 POINT_SPREAD_MM: Final = 0.45
@@ -24,12 +25,30 @@ _UNKNOWN: Final = 1e12
 
 @dataclass(frozen=True)
 class Imaging:
-    """How the slices are taken. scale: mm/pixel; noise_px: standard deviation per axis of an upright rod's centre;
-    thickness_mm: of the slice, 0 where it is not known and leaning rods shall count like upright ones."""
+    """How the slices are taken, and how well is known what the errors rest on.
+
+    scale: mm/pixel; noise_px: standard deviation per axis of an upright rod's centre; thickness_mm: of the slice, 0
+    where it is not known and leaning rods shall count like upright ones; frame_tolerance_mm: standard deviation per
+    axis of the ends of rods of unknown tolerance; scale_tolerance: standard deviation of sx and of sy, as a fraction.
+    By default rods and scale are perfect.
+    """
 
     scale: PixelScale
     noise_px: float
     thickness_mm: float
+    frame_tolerance_mm: float = 0.0
+    scale_tolerance: float = 0.0
+
+    @classmethod
+    def of(cls, scale: PixelScale, options: RegistrationOptions) -> Imaging:
+        """As the registration assumes it."""
+        return cls(
+            scale,
+            options.spot_noise_px,
+            options.slice_thickness_mm,
+            options.frame_tolerance_mm,
+            options.scale_tolerance,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,29 +56,41 @@ class Expected:
     """For s layouts and p poses slice_from_frame.
 
     visible: (s, p, n), the rods that the slice cuts; covariances: (s, p, 6, 6) of the pose from these, mm and rad, in
-    slice axes, as in `Pose.perturbed`; spot_information: (s, p, n, 2, 2), inverse covariances of the spots, mm^-2;
-    jacobian: (s, p, n, 2, 6), of the spots by the pose, zero for rods not visible; cuts.
+    slice axes, as in `Pose.perturbed`; information: (s, p, 8, 8), of the pose and of the shares by which sx and sy are
+    off, where nothing is known of the scale beforehand; cuts.
     """
 
     visible: NDArray[np.bool_]
     covariances: Array
-    spot_information: Array
-    jacobian: Array
+    information: Array
     cuts: Cuts
 
 
 def expected(layouts: Layouts, poses: Meetings, imaging: Imaging, left_out: int | None = None) -> Expected:
-    """Cramer-Rao bound of the pose from the visible rods; left_out: one that is taken for missing."""
+    """Cramer-Rao bound of the pose from the visible rods; left_out: one that is taken for missing.
+
+    Noise and the errors of the rods are independent from spot to spot. That of the scale is common to all: it stretches
+    the slice about the centre of pixel (0, 0).
+    """
     cuts = cut(layouts, poses.rotations, poses.translations)
     visible = cuts.inside.copy()
     if left_out is not None:
         visible[..., left_out] = False
     covariances = spot_covariances(cuts, layouts.diameters, imaging)
-    spot_information = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
-    jacobian: Array = np.where(visible[..., None, None], cut_jacobian(cuts, poses.translations), 0.0)
-    weighted = np.where(visible[..., None, None], spot_information, 0.0) @ jacobian
-    information = np.einsum("spnki,spnkj->spij", jacobian, weighted)
-    return Expected(visible, _inverse(information), spot_information, jacobian, cuts)
+    tolerances = layouts.tolerances_or(imaging.frame_tolerance_mm)
+    shown = visible[..., None, None]
+    covariances = covariances + np.where(shown, rod_covariances(layouts, tolerances, cuts), 0.0)
+    weights = np.where(shown, np.linalg.inv(covariances), 0.0)
+    # A scale that is off by a share moves a spot by that share of its coordinates.
+    by_scale = cuts.points_mm[..., None] * np.eye(2)
+    jacobian = np.where(shown, np.concatenate([cut_jacobian(cuts, poses.translations), by_scale], axis=-1), 0.0)
+    information = np.einsum("spnki,spnkj->spij", jacobian, weights @ jacobian)
+    # With a prior on the scale, it is integrated out; in a form that holds where the scale is known exactly, too.
+    variance = imaging.scale_tolerance**2
+    cross = information[..., 6:, :6]
+    inner = np.linalg.inv(np.eye(2) + variance * information[..., 6:, 6:])
+    taken = variance * np.swapaxes(cross, -1, -2) @ inner @ cross
+    return Expected(visible, _inverse(information[..., :6, :6] - taken), information, cuts)
 
 
 def spot_covariances(cuts: Cuts, diameters: Array, imaging: Imaging) -> Array:
@@ -90,6 +121,14 @@ def spot_covariances(cuts: Cuts, diameters: Array, imaging: Imaging) -> Array:
     noise = imaging.noise_px * math.sqrt(imaging.scale.sx * imaging.scale.sy)
     covariances: Array = noise**2 * worse
     return covariances
+
+
+def scale_information(found: Expected) -> Array:
+    """Inverse covariances (s, p, 2, 2) of the shares by which sx and sy are off, from one slice of unknown pose."""
+    by_pose, by_scale = found.information[..., :6, :6], found.information[..., 6:, :6]
+    # The pose is eliminated (Schur complement).
+    left: Array = found.information[..., 6:, 6:] - by_scale @ _inverse(by_pose) @ np.swapaxes(by_scale, -1, -2)
+    return 0.5 * (left + np.swapaxes(left, -1, -2))
 
 
 def point_covariances(covariances: Array, rotations: Array, point_in_frame: Array) -> Array:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereoreg_ros.design.ambiguity import Trial, reasons, trials
-from stereoreg_ros.design.expected_error import Expected, Imaging, expected, point_covariances
+from stereoreg_ros.design.expected_error import Expected, Imaging, expected, point_covariances, scale_information
 from stereoreg_ros.design.layouts import Layouts
 from stereoreg_ros.design.meeting import Meetings, meetings
 from stereoreg_ros.geometry.frame import Frame
@@ -28,13 +28,18 @@ from stereoreg_ros.uncertainty import error_ball_95
 
 # Rods that fix the scale too (Maurin 2009, section 3), and with it need one more than the pose.
 _RODS_FOR_SCALE = 5
+HANDEDNESS: Final = (
+    "axes must be right-handed: a mirrored image, or a frame file with left-handed axes, fits one slice exactly, and "
+    "only a series of slices shows it"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
     """What `inspect` found out over p poses in which at least `min_inliers` rods show.
 
-    shown: share of all poses drawn in which they do; visible: (p, n); error_origin_mm, error_target_mm: (p,), radii of
+    tolerances_mm: (n,), assumed standard deviation per axis of the rods' ends, the frame's own or the option's; shown:
+    share of all poses drawn in which they do; visible: (p, n); error_origin_mm, error_target_mm: (p,), radii of
     the 95 % error balls at the frame's origin and at the target; position_std_mm, rotation_std_deg: (3,), medians along
     and about the frame's axes; weakest_axis, weakest_rotation_axis: (3,), in the frame's axes, along and about which
     the pose is known worst on the whole; scale_std_percent: (p,) of the worse of sx and sy from one slice, infinite
@@ -45,6 +50,7 @@ class Inspection:
     frame: Frame
     options: RegistrationOptions
     scale: PixelScale
+    tolerances_mm: Array
     poses: Meetings
     shown: float
     visible: NDArray[np.bool_]
@@ -64,6 +70,10 @@ class Inspection:
         return {
             "frame": self.frame.name,
             "lines": len(self.frame),
+            "orientation_required": self.frame.orientation_required,
+            "spot_noise_px": self.options.spot_noise_px,
+            "tolerances_mm": dict(zip(self.frame.line_names, self.tolerances_mm.tolist(), strict=True)),
+            "scale_tolerance": self.options.scale_tolerance,
             "poses": len(self.poses),
             "share_of_poses_shown": self.shown,
             "visible_rods": {
@@ -83,6 +93,7 @@ class Inspection:
             "outcomes_one_rod_missing": dict(reasons(self.one_missing)),
             "wrong": sum(not trial.reason and not trial.right for trial in (*self.whole, *self.one_missing)),
             "twins": twins_of([*self.whole, *self.one_missing]),
+            "cautions": [HANDEDNESS],
         }
 
 
@@ -105,7 +116,7 @@ def inspect_frame(
     if not 0 <= largest_tilt_deg <= 180:
         raise ValueError(f"tilt is {largest_tilt_deg!r}, expected from 0 to 180 degrees")
     drawn = _drawn(frame, options, largest_tilt_deg, 4 * count, seed)
-    imaging = Imaging(scale, options.spot_noise_px, options.slice_thickness_mm)
+    imaging = Imaging.of(scale, options)
     layout = Layouts.of(frame)
     shows = expected(layout, drawn, imaging).visible[0].sum(axis=-1) >= options.min_inliers
     if not shows.any():
@@ -122,6 +133,7 @@ def inspect_frame(
         frame=frame,
         options=options,
         scale=scale,
+        tolerances_mm=layout.tolerances_or(options.frame_tolerance_mm),
         poses=poses,
         shown=float(shows.mean()),
         visible=bound.visible[0],
@@ -131,7 +143,7 @@ def inspect_frame(
         rotation_std_deg=np.degrees(np.sqrt(np.median(np.einsum("pii->pi", in_frame[:, 3:, 3:]), axis=0))),
         weakest_axis=_upright(np.linalg.eigh(mean[:3, :3])[1][:, -1]),
         weakest_rotation_axis=_upright(np.linalg.eigh(mean[3:, 3:])[1][:, -1]),
-        scale_std_percent=_scale_std_percent(bound, poses, imaging),
+        scale_std_percent=_scale_std_percent(bound),
         singular=_singular(frame, bound.cuts, bound.visible[0]),
         whole=tuple(trial for trial in tried if trial.left_out is None),
         one_missing=tuple(trial for trial in tried if trial.left_out is not None),
@@ -210,20 +222,12 @@ def _upright(axis: Array) -> Array:
     return upright
 
 
-def _scale_std_percent(bound: Expected, poses: Meetings, imaging: Imaging) -> Array:
-    """Of the worse of sx and sy, from one slice whose pose is unknown: the pose is eliminated (Schur complement)."""
-    visible = bound.visible[0]
-    weight = np.where(visible[..., None, None], bound.spot_information[0], 0.0)
-    # A scale that is larger by a share moves the mm of a spot by that share of its coordinates.
-    by_scale = np.where(visible[..., None, None], bound.cuts.points_mm[0][..., None] * np.eye(2), 0.0)
-    by_scale = np.nan_to_num(by_scale)
-    by_pose = bound.jacobian[0]
-    scale_scale = np.einsum("pnki,pnkl,pnlj->pij", by_scale, weight, by_scale)
-    scale_pose = np.einsum("pnki,pnkl,pnlj->pij", by_scale, weight, by_pose)
-    left = scale_scale - scale_pose @ bound.covariances[0] @ np.swapaxes(scale_pose, 1, 2)
-    values, vectors = np.linalg.eigh(0.5 * (left + np.swapaxes(left, 1, 2)))
+def _scale_std_percent(bound: Expected) -> Array:
+    """Of the worse of sx and sy, from one slice whose pose is unknown."""
+    values, vectors = np.linalg.eigh(scale_information(bound)[0])
     variances = np.einsum("pik,pk->pi", vectors**2, 1 / np.maximum(values, 1e-12))
-    found = (visible.sum(axis=1) >= _RODS_FOR_SCALE) & (values[:, 0] > 1e-6 * np.einsum("pii->p", scale_scale))
+    with_pose_known = np.einsum("pii->p", bound.information[0, :, 6:, 6:])
+    found = (bound.visible[0].sum(axis=1) >= _RODS_FOR_SCALE) & (values[:, 0] > 1e-6 * with_pose_known)
     return np.where(found, 100 * np.sqrt(variances.max(axis=1)), np.inf)
 
 

@@ -42,7 +42,7 @@ def _draw_rods(axes: Axes3D, inspection: Inspection) -> None:
 def _draw_places(figure: Figure, axes: Axes, inspection: Inspection) -> None:
     """The 95 % error of a target in the plane z = 0 of the frame, over poses that show the frame."""
     frame, options = inspection.frame, inspection.options
-    imaging = Imaging(inspection.scale, options.spot_noise_px, options.slice_thickness_mm)
+    imaging = Imaging.of(inspection.scale, options)
     poses = inspection.poses.take(slice(_MAP_POSES))
     covariances = expected(Layouts.of(frame), poses, imaging).covariances
     ends = np.concatenate([frame.starts, frame.ends])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stereoreg_ros.design.ambiguity import Trial, reasons
-from stereoreg_ros.design.inspection import Inspection, twins_of
+from stereoreg_ros.design.inspection import HANDEDNESS, Inspection, twins_of
 from stereoreg_ros.geometry.pose import Array
 
 _MOST_TWINS = 5
@@ -22,7 +22,8 @@ def table_of(inspection: Inspection) -> list[str]:
         f"{frame.name}: {len(frame)} rods; {len(inspection.poses)} slices that show {options.min_inliers} or more, "
         f"{100 * inspection.shown:.0f} % of those that meet its sphere",
         f"assumed: spots to {options.spot_noise_px:g} pixel of {inspection.scale.sx:g} x {inspection.scale.sy:g} mm, "
-        f"slices of {options.slice_thickness_mm:g} mm",
+        f"slices of {options.slice_thickness_mm:g} mm, {_tolerances(inspection)}, scale to "
+        f"{100 * options.scale_tolerance:g} % (standard deviations)",
         "",
         "rods in a slice       " + ", ".join(f"{n}: {100 * np.mean(rods == n):.0f} %" for n in np.unique(rods)),
         "each rod is in        "
@@ -54,7 +55,22 @@ def table_of(inspection: Inspection) -> list[str]:
         )
     if len(twins) > _MOST_TWINS:
         lines.append(f"  and {len(twins) - _MOST_TWINS} more twins")
+    if frame.orientation_required:
+        lines.append("orientation required: without a nominal orientation the frame is refused")
+    lines.append(HANDEDNESS)
     return lines
+
+
+def _tolerances(inspection: Inspection) -> str:
+    """What the rods' ends were taken to be known to, and whether the frame file or the option says so."""
+    names, tolerances = inspection.frame.line_names, inspection.tolerances_mm
+    if (tolerances == tolerances[0]).all():
+        told = f"{tolerances[0]:g} mm"
+    else:
+        told = ", ".join(f"{name} {one:g}" for name, one in zip(names, tolerances, strict=True)) + " mm"
+    own = ~np.isnan(inspection.frame.tolerances_or(np.nan))
+    source = "frame file" if own.all() else "frame_tolerance_mm" if not own.any() else "frame file, frame_tolerance_mm"
+    return f"rods' ends to {told} per axis ({source})"
 
 
 def _quantiles(values: Array) -> str:

@@ -16,13 +16,14 @@ from stereoreg_ros.geometry.pose import Array
 class Layouts:
     """s layouts of n rods, for `cut` with p poses: the derived arrays have an axis of length one for the poses.
 
-    starts, ends: (s, n, 3) mm; diameters: (n,) mm. directions, origins: (s, 1, n, 3); lambda_min, lambda_max:
-    (s, 1, n); all as in `Frame`.
+    starts, ends: (s, n, 3) mm; diameters: (n,) mm; tolerances_mm: (n,), NaN where not known, as of a drawing.
+    directions, origins: (s, 1, n, 3); lambda_min, lambda_max: (s, 1, n); all as in `Frame`.
     """
 
     starts: Array
     ends: Array
     diameters: Array
+    tolerances_mm: Array | None = None
     directions: Array = field(init=False)
     origins: Array = field(init=False)
     lambda_min: Array = field(init=False)
@@ -33,7 +34,9 @@ class Layouts:
         length = np.linalg.norm(span, axis=-1)
         directions = span / length[..., None]
         lambda_min = np.einsum("sni,sni->sn", directions, self.starts)
+        unknown = np.full(len(self.diameters), np.nan)
         derived = {
+            "tolerances_mm": unknown if self.tolerances_mm is None else self.tolerances_mm,
             "directions": directions[:, None],
             "origins": (self.starts - lambda_min[..., None] * directions)[:, None],
             "lambda_min": lambda_min[:, None],
@@ -45,16 +48,22 @@ class Layouts:
     def __len__(self) -> int:
         return len(self.starts)
 
+    def tolerances_or(self, default_mm: float) -> Array:
+        """Standard deviations (n,) per axis of the rods' ends, mm; `default_mm` for rods of unknown tolerance."""
+        tolerances = np.asarray(self.tolerances_mm, dtype=np.float64)
+        known: Array = np.where(np.isnan(tolerances), default_mm, tolerances)
+        return known
+
     @classmethod
     def of(cls, frame: Frame) -> Layouts:
         """The one layout of a frame."""
-        return cls(frame.starts[None], frame.ends[None], frame.diameters)
+        return cls(frame.starts[None], frame.ends[None], frame.diameters, frame.tolerances_mm)
 
     def frame(self, row: int, name: str) -> Frame:
         """One of the layouts as a frame; its rods are called a, b, c, ..."""
         n = len(self.diameters)
         names = string.ascii_lowercase[:n] if n <= len(string.ascii_lowercase) else [f"r{i}" for i in range(n)]
-        return Frame(name, tuple(names), self.starts[row], self.ends[row], self.diameters)
+        return Frame(name, tuple(names), self.starts[row], self.ends[row], self.diameters, self.tolerances_mm)
 
 
 @dataclass(frozen=True)

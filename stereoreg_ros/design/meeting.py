@@ -11,7 +11,8 @@ from scipy.stats import qmc
 
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 
-# Where the frame's middle is in the slice, mm: matters to nothing but the looks of the spots.
+# Where the frame's middle is in the slice, mm. It matters only to the error of the scale, which moves the frame as a
+# whole by its share of the distance from pixel (0, 0).
 MIDDLE_MM = (120.0, 120.0)
 
 

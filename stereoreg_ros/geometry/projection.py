@@ -85,6 +85,24 @@ def cut_jacobian(cuts: Cuts, translations: Array) -> Array:
     return jacobian
 
 
+def rod_covariances(frame: BoundedLines, tolerances_mm: Array, cuts: Cuts) -> Array:
+    """Covariances (..., n, 2, 2) mm^2 of where the slice cuts rods whose ends are not where the frame file has them.
+
+    tolerances_mm: (n,), standard deviation per axis of each rod's ends. The two ends err independently, so that the
+    middle of a rod is known better than its ends; a point of the rod that is off by e moves the cut by
+    e_xy - slope e_z. NaN where a rod runs within the slice.
+    """
+    cosine = np.where(np.isnan(cuts.lambdas), np.nan, cuts.directions[..., 2])
+    along = (cuts.lambdas - frame.lambda_min) / (frame.lambda_max - frame.lambda_min)
+    variance = tolerances_mm**2 * ((1.0 - along) ** 2 + along**2)
+    slope_x, slope_y = cuts.directions[..., 0] / cosine, cuts.directions[..., 1] / cosine
+    covariances: Array = np.empty((*variance.shape, 2, 2))
+    covariances[..., 0, 0] = variance * (1.0 + slope_x**2)
+    covariances[..., 1, 1] = variance * (1.0 + slope_y**2)
+    covariances[..., 0, 1] = covariances[..., 1, 0] = variance * slope_x * slope_y
+    return covariances
+
+
 def project(frame: Frame, slice_from_frame: Pose, scale: PixelScale) -> tuple[Array, Cuts]:
     """Pixels (n, 2) at which the lines of `frame` cut the slice (Maurin 2009, eq. 28), and the cuts in mm."""
     cuts = cut(frame, slice_from_frame.rotation, slice_from_frame.translation)

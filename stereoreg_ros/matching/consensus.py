@@ -12,19 +12,19 @@ from scipy.spatial.transform import Rotation
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
+from stereoreg_ros.matching.clutter import matched_densities
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.pose_volume import low_stretch, plane_sample, pose_volume, stretch
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.significance import (
     Chance,
     area_of_uniform_mm2,
-    clutter_area_mm2,
     log10_expected,
     lucky_chi_square,
     share_of,
 )
-from stereoreg_ros.matching.spots import Spots
-from stereoreg_ros.matching.visibility import LEAST_COSINE, SURE_MM
+from stereoreg_ros.matching.spots import Spots, whitening_of
+from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE, SURE_MM
 from stereoreg_ros.options import RegistrationOptions
 
 # Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
@@ -32,10 +32,20 @@ GATE = 18.4
 # Height in chi-square of the ridge between two optima below which they are one valley; and its largest extent, rad.
 _RIDGE = 4.0
 _LARGEST_VALLEY = 0.5
+# Squared distance, in standard deviations, below which two optima are one.
+_SAME_OPTIMUM = 0.1
 # So far behind the best one (log-likelihood) an explanation is forgotten.
 _FAR_BEHIND = 30.0
 # Explanations are never held to be told apart by less than this many decades of likelihood.
 _LEAST_DECADES_APART = 1.0
+# By how much (log-likelihood) `evidence` may prefer an explanation of fewer rods more than `score` does: where the pose
+# adapts to a spot in one direction, by ten times the spot's uncertainty.
+EVIDENCE_SLACK = 2.5
+# How far a rod's own spot lies from where a wrong pose has the rod: Student's distribution of two degrees of freedom in
+# the plane, of this scale per axis, as most mistakes move it by a few millimetres and some by a centimetre.
+_NEAR_MISS_MM = 2.0
+# By how much, rad, a wrong pose turns the way that a leaning rod's spot takes.
+_WAY_TURNED = 0.2
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
 MISSING_COST = 3.0
 
@@ -43,9 +53,57 @@ MISSING_COST = 3.0
 def count_missing(spots: Spots, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> NDArray[np.intp]:
     """Numbers (m,) of rods without a spot that the slice must cut, well within their ends and among the spots."""
     with np.errstate(invalid="ignore"):
-        sure = (cuts.lambdas >= frame.lambda_min + SURE_MM) & (cuts.lambdas <= frame.lambda_max - SURE_MM)
-        sure &= (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE) & spots.surround(cuts.points_mm)
-    return np.asarray((sure & (spot_of_line == UNMATCHED)).sum(axis=1))
+        must_show = _well_within_ends(frame, cuts) & spots.surround(cuts.points_mm)
+    return np.asarray((must_show & (spot_of_line == UNMATCHED)).sum(axis=-1))
+
+
+def _well_within_ends(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        within = (cuts.lambdas >= frame.lambda_min + SURE_MM) & (cuts.lambdas <= frame.lambda_max - SURE_MM)
+    return np.asarray(within & (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE))
+
+
+def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
+    """By how much (log-likelihood) unmatched spots beside the places of rods without a spot speak against a pose.
+
+    A rod may fail to show, and a false spot may lie anywhere; that it lies just beside the place of such a rod is much
+    likelier where it is the rod's own, and the pose, the frame file or the pixel spacing is wrong by a few millimetres.
+    """
+    others = np.setdiff1d(np.arange(len(spots.mm)), hypothesis.spot_of_line)
+    cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
+    with np.errstate(invalid="ignore"):
+        possible = (cuts.lambdas >= frame.lambda_min - END_SLACK_MM) & (cuts.lambdas <= frame.lambda_max + END_SLACK_MM)
+        possible &= (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE) & (hypothesis.spot_of_line == UNMATCHED)
+    if not possible.any() or not len(others):
+        return 0.0
+    off = spots.mm[others] - cuts.points_mm[possible][:, None]
+    density = _near_miss_densities(off, frame, cuts, possible).max(axis=1)
+    evidence = np.log(density / spots.clutter_density(frame))
+    # That the image reaches there, the spot shows.
+    cost = MISSING_COST * _well_within_ends(frame, cuts)[possible]
+    return float(np.where(evidence > 0, evidence + cost, 0.0).sum())
+
+
+def _near_miss_densities(off: Array, frame: Frame, cuts: Cuts, rods: NDArray[np.bool_]) -> Array:
+    """Densities (k, s) per mm^2 with which a wrong pose has the spots of rods at distances off (k, s, 2) mm.
+
+    A few millimetres off, in any direction; or, where a tilt is wrong, anywhere along the way that a leaning rod's spot
+    takes through the slice when the frame is moved.
+    """
+    squared = (off**2).sum(axis=2)
+    anywhere = (1.0 + squared / (2 * _NEAR_MISS_MM**2)) ** -2 / (2 * math.pi * _NEAR_MISS_MM**2)
+    directions = cuts.directions[rods, :2]
+    run = np.linalg.norm(directions, axis=1)
+    length_mm = run * (frame.lambda_max - frame.lambda_min)[rods]
+    unit = directions / np.maximum(run, 1e-9)[:, None]
+    along = np.einsum("ksi,ki->ks", off, unit)
+    across = np.einsum("ksi,ki->ks", off, np.stack([-unit[:, 1], unit[:, 0]], axis=1))
+    reach = run[:, None] * np.stack([frame.lambda_min - cuts.lambdas, frame.lambda_max - cuts.lambdas], axis=1)[rods]
+    on_way = (along >= reach[:, :1]) & (along <= reach[:, 1:])
+    # Where the pose is wrong, so is the direction of that way.
+    scale = np.hypot(math.sqrt(2.0) * _NEAR_MISS_MM, _WAY_TURNED * along)
+    beside = (1.0 + (across / scale) ** 2) ** -1.5 / (2 * scale)
+    return np.asarray(np.maximum(anywhere, np.where(on_way, beside / np.maximum(length_mm[:, None], scale), 0.0)))
 
 
 def score(hypothesis: Hypothesis, gains: Array) -> float:
@@ -57,6 +115,14 @@ def score(hypothesis: Hypothesis, gains: Array) -> float:
     return float(gains[matched].sum()) - hypothesis.chi_square / 2 - MISSING_COST * hypothesis.missing
 
 
+def evidence(hypothesis: Hypothesis, gains: Array) -> float:
+    """The same with the likelihood integrated over the pose: one spot more that the pose adapts to says less.
+
+    Of explanations with the same rods it orders as `score` does, but for how well these fix the pose.
+    """
+    return score(hypothesis, gains) - 0.5 * float(np.linalg.slogdet(hypothesis.information)[1])
+
+
 def distinct(found: list[Hypothesis], gains: Array) -> list[Hypothesis]:
     """The explanations best first, without those that say the same as a better one; gains: see `Spots.gains`.
 
@@ -66,17 +132,28 @@ def distinct(found: list[Hypothesis], gains: Array) -> list[Hypothesis]:
     scores = {id(hypothesis): score(hypothesis, gains) for hypothesis in found}
     found = sorted(found, key=lambda h: -scores[id(h)])
     kept: list[Hypothesis] = []
+    # What each of these stands for: itself and the other optima of its valley.
+    optima: list[list[Hypothesis]] = []
     for hypothesis in found:
         if scores[id(found[0])] - scores[id(hypothesis)] > _FAR_BEHIND:
             break
         differences = _differences(hypothesis, kept)
         row = _row_of_same(differences, hypothesis, kept)
-        if row is not None:
+        if row is None:
+            kept.append(hypothesis)
+            optima.append([hypothesis])
+        elif not _is_known(hypothesis, optima[row]):
             other = kept[row]
             kept[row] = _widened(other, differences[row], score(other, gains) - score(hypothesis, gains))
-        else:
-            kept.append(hypothesis)
+            optima[row].append(hypothesis)
     return kept
+
+
+def _is_known(hypothesis: Hypothesis, optima: list[Hypothesis]) -> bool:
+    """Whether one of these optima is the same, but for where a search ended: within a fraction of its uncertainty."""
+    differences = _differences(hypothesis, optima)
+    squared = np.einsum("ki,kij,kj->k", differences, np.array([one.information for one in optima]), differences)
+    return bool((squared < _SAME_OPTIMUM).any())
 
 
 def _differences(hypothesis: Hypothesis, others: list[Hypothesis]) -> Array:
@@ -123,7 +200,7 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
 
     apart: see `decades_apart`.
 
-    They must come near the best one in likelihood; of fewer rods, also in how rare they are by chance: from a few spots
+    They must come near the best one in evidence; of fewer rods, also in how rare they are by chance: from a few spots
     of the frame's own, chance soon makes a match of one or two rods less. Of as many rods they are rivals however lucky
     the residuals of the best one are.
     """
@@ -131,25 +208,40 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
         return []
     gains = spots.gains(frame)
     rivals = [
-        replace(one, log10_false_alarms=log10_false_alarms(one, spots, frame, prior))
+        replace(one, log10_false_alarms=log10_false_alarms(one, spots, frame, prior, in_order=False))
         for one in found
-        if score(found[0], gains) - score(one, gains) < apart * math.log(10)
+        if evidence(found[0], gains) - evidence(one, gains) < apart * math.log(10)
     ]
     most = rivals[0].log10_false_alarms + apart
-    return [one for one in rivals if one.inliers >= rivals[0].inliers or one.log10_false_alarms <= most]
+    rivals = [one for one in rivals if one.inliers >= rivals[0].inliers or one.log10_false_alarms <= most]
+    best = replace(
+        rivals[0],
+        log10_false_alarms=log10_false_alarms(rivals[0], spots, frame, prior),
+        near_misses=near_misses(rivals[0], spots, frame),
+    )
+    return [best, *rivals[1:]]
 
 
-def log10_false_alarms(hypothesis: Hypothesis, spots: Spots, frame: Frame, prior: Prior) -> float:
-    """log10 of how many explanations as good as this one chance brings, over its share of those that are allowed."""
+def log10_false_alarms(
+    hypothesis: Hypothesis, spots: Spots, frame: Frame, prior: Prior, in_order: bool = True
+) -> float:
+    """log10 of how many explanations as good as this one chance brings, over its share of those that are allowed.
+
+    in_order: whether to look for order in the clutter too, which takes longer.
+    """
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
     matched = hypothesis.spot_of_line[lines]
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
-    jacobian = (spots.whitening[matched] @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
-    variance_mm2 = _typical(spots.variances_mm2[matched])
+    covariances = spots.match_covariances(frame, cuts, hypothesis.spot_of_line)[lines]
+    jacobian = (whitening_of(covariances) @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
+    variance_mm2 = _typical(np.sqrt(np.linalg.det(covariances)))
     ratio = float(stretch(jacobian.T @ jacobian, variance_mm2))
-    area_mm2 = clutter_area_mm2(spots.mm, matched, spots.slice_area_mm2)
-    volume = pose_volume(frame, len(lines), prior, area_mm2)
-    chance = Chance(len(spots.mm), area_mm2, variance_mm2, ratio * volume)
+    area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
+    # Clutter that is denser where the matched spots lie is as if all were spread over less.
+    density = math.exp(float(np.log(matched_densities(spots.mm, matched, area_mm2, in_order)).mean()))
+    dense_mm2 = len(spots.mm) / density
+    volume = pose_volume(frame, len(lines), prior, min(area_mm2, dense_mm2))
+    chance = Chance(len(spots.mm), dense_mm2, variance_mm2, ratio * volume)
     return log10_expected(len(lines), hypothesis.chi_square, chance) - math.log10(share_of(len(lines), len(frame)))
 
 

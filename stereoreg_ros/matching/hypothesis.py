@@ -20,7 +20,8 @@ class Hypothesis:
     rotation (3, 3), translation (3,) mm: slice_from_frame, refined by maximum likelihood; spot_of_line (n,): for each
     rod the row of its spot, or UNMATCHED; chi_square: squared residuals over the noise; information (6, 6): inverse
     covariance of the pose (see `solvers.maximum_likelihood.Refined`); missing: number of rods that the slice must cut
-    among the spots, and that have none; log10_false_alarms: see `matching.significance`.
+    among the spots, and that have none; near_misses: by how much (log-likelihood) those of them that have an unmatched
+    spot close by speak against the explanation; log10_false_alarms: see `matching.significance`.
     """
 
     rotation: Array
@@ -29,6 +30,7 @@ class Hypothesis:
     chi_square: float
     information: Array
     missing: int
+    near_misses: float = 0.0
     log10_false_alarms: float = math.nan
 
     @property

@@ -20,7 +20,7 @@ from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.consensus import count_missing, decades_apart, distinct, judged
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.spots import Spots, whitening_of
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION, POSE_RANK, assemble, condition_number
 from stereoreg_ros.solvers.ls_tz import solve_system
@@ -118,13 +118,18 @@ def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions
     if not starts:
         return Found([], SAMPLE + 1)
     spot_of_line = np.array([assigned for _, assigned in starts])
+    rotations = np.array([start.rotation for start, _ in starts])
+    translations = np.array([start.translation for start, _ in starts])
+    used = spot_of_line != UNMATCHED
+    cuts = cut(frame, rotations, translations)
     refined = refine(
         frame,
-        np.array([start.rotation for start, _ in starts]),
-        np.array([start.translation for start, _ in starts]),
+        rotations,
+        translations,
         spots.mm[spot_of_line],
-        spot_of_line != UNMATCHED,
-        spots.whitening[spot_of_line],
+        used,
+        whitening_of(spots.match_covariances(frame, cuts, spot_of_line)),
+        common=spots.common(frame, cuts, spot_of_line, used),
     )
     kept = refined.converged & (prior.angles(refined.rotations) <= prior.max_rotation)
     missing = count_missing(spots, frame, refined.cuts, spot_of_line)

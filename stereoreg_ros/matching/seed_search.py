@@ -263,7 +263,11 @@ def _predict(
         third = origins @ dual_v - (dual_v * points[0]).sum(axis=0) + lambdas * (directions @ dual_v)
         weights = (1.0 - second - third, second, third)
         xx = spots.sigma_mm**2 * (1.0 + weights[0] ** 2 + weights[1] ** 2 + weights[2] ** 2)
-        yy, xy = xx.copy(), np.zeros_like(xx)
+        # A rod that is off along the slice's normal is cut elsewhere by as much as it leans.
+        rod_mm2 = spots.tolerances.rod_mm[others, None] ** 2
+        xy = rod_mm2 * slope_x * slope_y
+        yy = xx + rod_mm2 * slope_y**2
+        xx += rod_mm2 * slope_x**2
         moved_x = [weights[i] * (slope_x * own_z[i] - own_x[i]) for i in range(3)]
         moved_y = [weights[i] * (slope_y * own_z[i] - own_y[i]) for i in range(3)]
         for i in range(3):

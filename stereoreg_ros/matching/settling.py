@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.geometry.projection import cut_jacobian
+from stereoreg_ros.geometry.projection import cut, cut_jacobian
 from stereoreg_ros.matching.consensus import GATE, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.seed_search import Starts
-from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.spots import Spots, whitening_of
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
@@ -32,18 +32,7 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
         enough = (assigned != UNMATCHED).sum(axis=1) >= min_inliers
         same = (assigned == spot_of_line).all(axis=1)
         at_rest = same & (refined.converged | (number > 0))
-        missing = count_missing(spots, frame, refined.cuts, assigned)
-        settled += [
-            Hypothesis(
-                refined.rotations[i],
-                refined.translations[i],
-                assigned[i],
-                float(refined.chi_square[i]),
-                refined.information[i],
-                int(missing[i]),
-            )
-            for i in np.flatnonzero(enough & at_rest)
-        ]
+        settled += _polished(spots, frame, refined.take(enough & at_rest), assigned[enough & at_rest])
         # What another start from the same seed has come to is not sought again.
         known = {(origin[i], assigned[i].tobytes()) for i in np.flatnonzero(at_rest)}
         rows = np.array(
@@ -61,11 +50,36 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
     return settled
 
 
+def _polished(spots: Spots, frame: Frame, refined: Refined, spot_of_line: NDArray[np.intp]) -> list[Hypothesis]:
+    """Explanations of settled matches, with the errors of rods and scale as they are at these poses.
+
+    A start may be far from where it leads: a rod's error counts by how the rod leans there.
+    """
+    if not len(spot_of_line):
+        return []
+    polished = _refine(spots, frame, refined.rotations, refined.translations, spot_of_line, _FIRST_STEPS)
+    missing = count_missing(spots, frame, polished.cuts, spot_of_line)
+    return [
+        Hypothesis(
+            polished.rotations[i],
+            polished.translations[i],
+            spot_of_line[i],
+            float(polished.chi_square[i]),
+            polished.information[i],
+            int(missing[i]),
+        )
+        for i in range(len(spot_of_line))
+    ]
+
+
 def _refine(
     spots: Spots, frame: Frame, rotations: Array, translations: Array, spot_of_line: NDArray[np.intp], steps: int
 ) -> Refined:
     used = spot_of_line != UNMATCHED
-    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, spots.whitening[spot_of_line], steps)
+    cuts = cut(frame, rotations, translations)
+    whitening = whitening_of(spots.match_covariances(frame, cuts, spot_of_line))
+    common = spots.common(frame, cuts, spot_of_line, used)
+    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, whitening, steps, common)
 
 
 def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
@@ -77,6 +91,7 @@ def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
         # Of a spot used for the pose the residual varies less than this, of another one just as much: a gate for both.
         predicted = jacobian @ covariance[:, None] @ np.swapaxes(jacobian, -1, -2)
         known = predicted[..., 0, 0] + predicted[..., 1, 1] < _VAGUE * spots.sigma_mm**2  # false for NaN too
+    predicted = predicted + spots.tolerances.rod_covariances(frame, refined.cuts)
     noise = spots.covariances_mm2
     xx, yy, xy = (predicted[..., i, j, None] + noise[:, i, j] for i, j in ((0, 0), (1, 1), (0, 1)))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -89,7 +104,7 @@ def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
     in_slack &= np.abs(refined.cuts.directions[..., 2]) >= LEAST_COSINE
     possible = (in_slack & known)[..., None]
     if spots.streaks is not None:
-        possible = possible & spots.streaks.allow(refined.cuts)
+        possible = possible & spots.streaks.allow(frame, refined.cuts)
     squared = np.where(possible, squared, np.inf)
     nearest = squared.argmin(axis=2)
     least = np.take_along_axis(squared, nearest[..., None], axis=2)[..., 0]

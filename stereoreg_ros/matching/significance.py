@@ -17,16 +17,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import gammainc, gammaincinv
+from scipy.special import gammaincinv
 
 from stereoreg_ros.geometry.pose import Array
 
 # Chi-square of a perfect fit, to rounding; exact data must not make the number of false alarms vanish.
 _LEAST_CHI_SQUARE = 1e-6
 _LEAST_AREA_MM2 = 100.0
-# Clutter around the frame that uniform clutter would bring less often than this is taken to be denser there.
-_CROWDED = 0.01
 _FEWEST, _SHARE_OF_FEWEST, _SHARE_OF_MORE = 4, 0.01, 0.125
 # How seldom a true match has a residual as small as that by which a search for one is held to be hopeless.
 _LUCK = 0.01
@@ -76,26 +73,6 @@ def area_of_uniform_mm2(spots_mm: Array, slice_area_mm2: float | None) -> float:
     width, height = np.ptp(spots_mm, axis=0)
     box = float(width * height) * ((count + 1) / (count - 1)) ** 2
     return max(slice_area_mm2 or box, _LEAST_AREA_MM2)
-
-
-def clutter_area_mm2(spots_mm: Array, matched: NDArray[np.intp], slice_area_mm2: float | None) -> float:
-    """Area in mm^2 over which the spots (s, 2) mm would be spread if they were everywhere as dense as around the frame.
-
-    matched: rows of the k spots given to rods; slice_area_mm2: see `area_of_uniform_mm2`.
-    Around the frame (half again as far as the matched spots reach) clutter can be denser than elsewhere: where
-    there are more unmatched spots than uniform ones would be once in a hundred slices, their density is taken.
-    """
-    count = len(spots_mm)
-    everywhere = area_of_uniform_mm2(spots_mm, slice_area_mm2)
-    centre = spots_mm[matched].mean(axis=0)
-    radius = 1.5 * float(np.linalg.norm(spots_mm[matched] - centre, axis=1).max())
-    nearby = int((np.linalg.norm(spots_mm - centre, axis=1) <= radius).sum()) - len(matched)
-    around = min(math.pi * radius**2, everywhere)
-    expected = (count - len(matched)) * around / everywhere
-    # Probability of `nearby` or more by a Poisson law of that mean.
-    if nearby > 0 and gammainc(nearby, expected) < _CROWDED:
-        return min(everywhere, count * around / nearby)
-    return everywhere
 
 
 def share_of(inliers: int, lines: int) -> float:

@@ -12,11 +12,15 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts
 from stereoreg_ros.matching.significance import area_of_uniform_mm2
+from stereoreg_ros.matching.tolerances import Tolerances
 
 # A spot may be longer or shorter than its rod has it, by a share and a slack, mm, as the slice's profile is not a box
 # and the point spread is not known; from a length on, mm, it must lie along the rod (cosine).
 _LENGTH_SHARE, _LENGTH_SLACK_MM = 0.5, 1.5
 _LONG_MM, _LEAST_ALIGNED = 3.0, 0.8
+# Of a solid rod cut at an angle, the spot is an ellipse: its squared length, as `Streaks` has it, is that share of
+# (diameter * slope) squared. A tube that is bright in its wall only is longer by the square root of two.
+_OF_DIAMETER, _HOLLOW = 0.75, 2.0
 
 
 class Streaks(NamedTuple):
@@ -30,62 +34,105 @@ class Streaks(NamedTuple):
     cut_short: NDArray[np.bool_]
     thickness_mm: float
 
-    def allow(self, cuts: Cuts) -> NDArray[np.bool_]:
-        """Whether each spot (..., n, s) may be that of each rod, by its length and, of long ones, its direction."""
+    def allow(self, frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
+        """Whether each spot (..., n, s) may be that of each rod, by its length and, of long ones, its direction.
+
+        A thick rod's spot is longer than the slice's thickness makes it, and one of a rod that ends within the slice
+        may be shorter.
+        """
         with np.errstate(invalid="ignore", divide="ignore"):
-            wanted = self.thickness_mm * cuts.directions[..., :2] / cuts.directions[..., 2:]
-            wanted_length = np.linalg.norm(wanted, axis=-1)[..., None]
+            slope = cuts.directions[..., :2] / cuts.directions[..., 2:]
+            steepness = np.linalg.norm(slope, axis=-1)
+            half = self.thickness_mm / 2 / np.abs(cuts.directions[..., 2])
+            whole = (cuts.lambdas >= frame.lambda_min + half) & (cuts.lambdas <= frame.lambda_max - half)
+            least = np.where(whole, self.thickness_mm * steepness, 0.0)[..., None]
+            most = steepness * np.hypot(self.thickness_mm, math.sqrt(_HOLLOW * _OF_DIAMETER) * frame.diameters)
             length = np.linalg.norm(self.along_mm, axis=-1)
-            allowed = length <= (1 + _LENGTH_SHARE) * wanted_length + _LENGTH_SLACK_MM
-            allowed &= self.cut_short | (length >= (1 - _LENGTH_SHARE) * wanted_length - _LENGTH_SLACK_MM)
-            aligned = np.abs(wanted @ self.along_mm.T) >= _LEAST_ALIGNED * wanted_length * length
-        return np.asarray(allowed & (aligned | (np.minimum(wanted_length, length) < _LONG_MM)))
+            allowed = length <= (1 + _LENGTH_SHARE) * most[..., None] + _LENGTH_SLACK_MM
+            allowed &= self.cut_short | (length >= (1 - _LENGTH_SHARE) * least - _LENGTH_SLACK_MM)
+            aligned = np.abs(slope @ self.along_mm.T) >= _LEAST_ALIGNED * steepness[..., None] * length
+        return np.asarray(allowed & (aligned | (np.minimum(most[..., None], length) < _LONG_MM)))
 
     def only(self, rows: NDArray[np.intp]) -> Streaks:
         """Those of some of the spots."""
         return self._replace(along_mm=self.along_mm[rows], cut_short=self.cut_short[rows])
 
 
+def whitening_of(covariances: Array) -> Array:
+    """Inverse Cholesky factors (..., 2, 2) of covariances: what turns a residual into one of unit variance."""
+    whitening: Array = np.zeros(covariances.shape)
+    xx, xy, yy = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    first = 1.0 / np.sqrt(xx)
+    second = 1.0 / np.sqrt(yy - xy * xy / xx)
+    whitening[..., 0, 0], whitening[..., 1, 1] = first, second
+    whitening[..., 1, 0] = -xy / xx * second
+    return whitening
+
+
 class Spots(NamedTuple):
     """Spots as the matcher sees them.
 
     mm: (s, 2) in the slice; covariances_mm2: (s, 2, 2), of the centres; slice_area_mm2: over which spots could lie,
-    None where not known. whitening: (s, 2, 2) 1/mm, turns a residual in mm into one of unit variance; variances_mm2:
-    (s,), product of the standard deviations along the two axes of each; sigma_mm: the largest of all. streaks: None
-    where the slice's thickness or the spots' lengths are not known.
+    None where not known. tolerances: how the frame and the scale may be off. variances_mm2: (s,), product of the
+    standard deviations along the two axes of each centre, a rod's error included where that is least; sigma_mm: the
+    largest per axis of any, with all that can be off before a pose is known. streaks: None where the slice's thickness
+    or the spots' lengths are not known.
     """
 
     mm: Array
     covariances_mm2: Array
     slice_area_mm2: float | None
-    whitening: Array
+    tolerances: Tolerances
     variances_mm2: Array
     sigma_mm: float
     streaks: Streaks | None
 
     @classmethod
     def of(
-        cls, mm: Array, covariances_mm2: Array, slice_area_mm2: float | None, streaks: Streaks | None = None
+        cls,
+        mm: Array,
+        covariances_mm2: Array,
+        slice_area_mm2: float | None,
+        tolerances: Tolerances,
+        streaks: Streaks | None = None,
     ) -> Spots:
         """Spots (s, 2) mm with the covariances (s, 2, 2) mm^2 of their centres."""
-        whitening = np.linalg.inv(np.linalg.cholesky(covariances_mm2))
-        variances = np.sqrt(np.linalg.det(covariances_mm2))
+        # In the middle of a rod its variance is half of that of its ends, and nowhere less.
+        rod_mm2 = 0.5 * float((tolerances.rod_mm**2).mean())
+        variances = np.sqrt(np.linalg.det(covariances_mm2 + rod_mm2 * np.eye(2)))
         largest = float(np.linalg.eigvalsh(covariances_mm2).max()) if len(mm) else 0.0
-        return cls(mm, covariances_mm2, slice_area_mm2, whitening, variances, math.sqrt(largest), streaks)
+        sigma_mm = math.hypot(math.sqrt(largest), tolerances.extent_mm)
+        return cls(mm, covariances_mm2, slice_area_mm2, tolerances, variances, sigma_mm, streaks)
 
     def gains(self, frame: Frame) -> Array:
         """Log-likelihood ratios (s,) of each spot right where a rod is predicted, to its being one of the clutter.
 
         The clutter is taken to be as dense as if every rod had a spot.
         """
+        return np.asarray(-np.log(self.clutter_density(frame) * 2 * math.pi * self.variances_mm2))
+
+    def clutter_density(self, frame: Frame) -> float:
+        """False spots per mm^2, if every rod has a spot; at least one false spot is reckoned with."""
         clutter = max(len(self.mm) - len(frame), 0) + 1
-        area_mm2 = area_of_uniform_mm2(self.mm, self.slice_area_mm2)
-        return np.asarray(np.log(area_mm2 / (clutter * 2 * math.pi * self.variances_mm2)))
+        return clutter / area_of_uniform_mm2(self.mm, self.slice_area_mm2)
+
+    def match_covariances(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> Array:
+        """Covariances (..., n, 2, 2) mm^2 of each rod's residual: of its spot's centre and of where the rod is cut.
+
+        spot_of_line: (..., n), rows of the spots; anything may stand where a rod has none.
+        """
+        covariances: Array = self.covariances_mm2[spot_of_line] + self.tolerances.rod_covariances(frame, cuts)
+        return covariances
+
+    def common(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp], used: NDArray[np.bool_]) -> Array | None:
+        """Errors that spots share, as `solvers.maximum_likelihood.refine` takes them; None where there are none."""
+        shared = self.tolerances.common(frame, cuts, self.mm[spot_of_line], used)
+        return shared if shared.any() else None
 
     def only(self, rows: NDArray[np.intp]) -> Spots:
         """Some of the spots."""
         streaks = None if self.streaks is None else self.streaks.only(rows)
-        return Spots.of(self.mm[rows], self.covariances_mm2[rows], self.slice_area_mm2, streaks)
+        return Spots.of(self.mm[rows], self.covariances_mm2[rows], self.slice_area_mm2, self.tolerances, streaks)
 
     def surround(self, points_mm: Array) -> NDArray[np.bool_]:
         """Which points (..., 2) mm lie within the box around the spots: there a rod would have been seen."""

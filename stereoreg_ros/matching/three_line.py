@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.consensus import (
+    EVIDENCE_SLACK,
+    count_missing,
     decades_apart,
     distinct,
     judged,
@@ -32,6 +34,7 @@ from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, Starts, search_seeds
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.matching.triple_order import further_triples, triple_order
 from stereoreg_ros.matching.valley_starts import starts_along_valley
 from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
@@ -49,9 +52,9 @@ _FEW_SPOTS = 30
 # An accepted explanation's spots are looked at from all triples of each set of four rods, as these have twins, and from
 # so many of each set of more.
 _FEWEST, _LOOKS_AT_FOUR, _LOOKS = 4, 4, 3
-# From so many rods on, only of a frame of which more than such a share of so many slices has twins; these are poses of
-# no more than this chi-square, with spots known to so many mm or worse.
-_FEWEST_WITHOUT_TWINS, _MANY_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 0.25, 32, 20.0, 0.25
+# From so many rods on, only of a frame of which any of so many typical slices has twins; these are poses of no more
+# than this chi-square, with spots known to so many mm or worse.
+_FEWEST_WITHOUT_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 32, 20.0, 0.25
 # Solvers that are kept, of a few megabytes each.
 _SOLVERS = 64
 # Explanations that chance brings less often than this (log10) are not sought beside one that was found.
@@ -88,7 +91,9 @@ def match(
                     break
                 found = distinct([*found, *search.level(level, math.inf, found)], gains)
             else:
-                most_chi_square = 2 * (level * gains.max() - score(found[0], gains) + apart * math.log(10))
+                most_chi_square = 2 * (
+                    level * gains.max() - score(found[0], gains) + apart * math.log(10) + EVIDENCE_SLACK
+                )
                 if most_chi_square < 0 or search.is_told_apart(level, found[0], apart):
                     break
                 further = search.level if search.has_rivals(level, most_chi_square) else search.level_of_twins
@@ -101,9 +106,39 @@ def match(
             found = distinct([*found, *search.second_look(_FEWEST, found)], gains)
             if found and search.is_acceptable(found[0]):
                 found = distinct([*found, *search.twins_of(found)], gains)
-    except _TooMuchWorkError:
+    except SearchGivenUpError:
         return Found([], least_rods, "given up: too many of them look like parts of the frame")
     return Found(judged(found, spots, frame, prior, apart), least_rods)
+
+
+def find_better(
+    spots: Spots,
+    frame: Frame,
+    prior: Prior,
+    options: RegistrationOptions,
+    allowed_log10: float,
+    least_score: float = -math.inf,
+    fewest: int = 0,
+) -> Hypothesis | None:
+    """An explanation within the prior that scores above `least_score`, and that chance brings less often than allowed.
+
+    The one of the most rods, or None where there is none of `fewest` or more. least_score: see `consensus.score`;
+    allowed_log10: see `consensus.log10_false_alarms`. Raises SearchGivenUpError where that would take too long to say.
+    """
+    gains = spots.gains(frame)
+    search = _Search(spots, frame, prior, replace(options, max_log10_false_alarms=allowed_log10))
+    for level in search.levels:
+        most_chi_square = 2 * (level * gains.max() - least_score)
+        if level < fewest or most_chi_square < 0 or search.hopeless(level):
+            break
+        better = [
+            one
+            for one in distinct([*search.level(level, most_chi_square, [])], gains)
+            if score(one, gains) > least_score and search.is_acceptable(one)
+        ]
+        if better:
+            return better[0]
+    return None
 
 
 def match_most(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> list[Hypothesis]:
@@ -116,12 +151,12 @@ def match_most(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOp
             found = distinct(list(search.level(level, math.inf, [])), spots.gains(frame))
             if found:
                 return judged(found, spots, frame, prior, decades_apart(options))
-    except _TooMuchWorkError:
+    except SearchGivenUpError:
         pass
     return []
 
 
-class _TooMuchWorkError(Exception):
+class SearchGivenUpError(Exception):
     """A search goes on for too long."""
 
 
@@ -147,7 +182,7 @@ class _Search:
 
     def _false_alarms(self, hypothesis: Hypothesis) -> float:
         if hypothesis not in self._log10_false_alarms:
-            value = log10_false_alarms(hypothesis, self._spots, self._frame, self._prior)
+            value = log10_false_alarms(hypothesis, self._spots, self._frame, self._prior, in_order=False)
             self._log10_false_alarms[hypothesis] = value
         return self._log10_false_alarms[hypothesis]
 
@@ -199,7 +234,7 @@ class _Search:
     def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """The same as `level`, but only from the spots of the best explanation known."""
         search, here, rows = self._among_own(known)
-        return _renumbered(search.level(level, most_chi_square, here), rows)
+        return self._renumbered(search.level(level, most_chi_square, here), rows)
 
     def twins_of(self, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """Twins of the best explanation, made of its spots, that one triple of rods may have missed.
@@ -208,10 +243,11 @@ class _Search:
         seeks what comes near the best with fewer rods.
         """
         yield from self._settled(starts_along_valley(known[0]))
+        yield from self._settled(_starts_without_one(known[0]))
         rods = known[0].inliers
         if _may_have_twins(self._frame, rods, self._spots.sigma_mm):
             search, here, rows = self._among_own(known)
-            yield from _renumbered(search.second_look(rods, here), rows)
+            yield from self._renumbered(search.second_look(rods, here), rows)
 
     def _among_own(self, known: list[Hypothesis]) -> tuple[_Search, list[Hypothesis], NDArray[np.intp]]:
         """The search among the spots of the best explanation known; what is known, in terms of these; their rows."""
@@ -223,10 +259,19 @@ class _Search:
         row_of[rows] = np.arange(len(rows))
         return search, [replace(one, spot_of_line=row_of[one.spot_of_line]) for one in known], rows
 
+    def _renumbered(self, found: Iterator[Hypothesis], rows: NDArray[np.intp]) -> Iterator[Hypothesis]:
+        """Explanations of some of the spots in terms of all; rows: of these spots."""
+        for one in found:
+            spot_of_line = np.where(one.spot_of_line != UNMATCHED, rows[one.spot_of_line], UNMATCHED)
+            # Among all spots more rods must show than among the few.
+            cuts = cut(self._frame, one.rotation, one.translation)
+            missing = int(count_missing(self._spots, self._frame, cuts, spot_of_line))
+            yield replace(one, spot_of_line=spot_of_line, missing=missing)
+
     def _spend(self, work: float) -> None:
         self._work += work
         if self._work > _MOST_WORK:
-            raise _TooMuchWorkError
+            raise SearchGivenUpError
 
     def _seeds(self, lines: tuple[int, int, int], level: int) -> list[SeedSearch]:
         """The seeds of the triple of rods where a slice may cut `level` rods or more."""
@@ -243,26 +288,30 @@ class _Search:
         return self._searched[lines]
 
 
-def _renumbered(found: Iterator[Hypothesis], rows: NDArray[np.intp]) -> Iterator[Hypothesis]:
-    """Explanations of some of the spots in terms of all; rows: of these spots."""
-    for one in found:
-        matched = one.spot_of_line != UNMATCHED
-        yield replace(one, spot_of_line=np.where(matched, rows[one.spot_of_line], UNMATCHED))
+def _starts_without_one(hypothesis: Hypothesis) -> Starts:
+    """Starts at a pose with each of its rods left out in turn.
+
+    A false spot may draw the pose to itself; from every seed, and with all its rods, the search then ends there.
+    """
+    lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
+    spot_of_line = np.tile(hypothesis.spot_of_line, (len(lines), 1))
+    spot_of_line[np.arange(len(lines)), lines] = UNMATCHED
+    rotations = np.tile(hypothesis.rotation, (len(lines), 1, 1))
+    translations = np.tile(hypothesis.translation, (len(lines), 1))
+    return Starts(rotations, translations, spot_of_line, np.arange(len(lines)))
 
 
 def _may_have_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:
-    """Whether so many spots of the frame, known to sigma_mm, have twins often enough to be looked for once more.
+    """Whether so many spots of the frame, known to sigma_mm, may have twins, so that these are looked for once more.
 
     The distances between k spots set 2k - 3 conditions to the six numbers of two slices that show the same: four spots
     have twins, and five near ones. From six on few slices have them, unless the frame is nearly symmetric.
     """
-    if rods < _FEWEST_WITHOUT_TWINS:
-        return True
-    return _twin_sample(frame, rods, sigma_mm).share > _MANY_TWINS
+    return rods < _FEWEST_WITHOUT_TWINS or _twin_sample(frame, rods, sigma_mm).any()
 
 
 class _TwinSample:
-    """Typical slices that show so many rods, and how many of them have a second explanation of them all."""
+    """Typical slices that show so many rods, and whether any of them has a second explanation of them all."""
 
     def __init__(self, frame: Frame, rods: int, sigma_mm: float) -> None:
         self._frame, self._rods, self._sigma_mm = frame, rods, sigma_mm
@@ -270,12 +319,11 @@ class _TwinSample:
         self._rng = np.random.default_rng(0)
         self._looked_at = self._twins = 0
 
-    @property
-    def share(self) -> float:
-        """Of those with twins; 1 where no slice shows so many rods."""
-        while self.look_at_next():
+    def any(self) -> bool:
+        """Whether a slice was found that has twins; true too where no slice shows so many rods."""
+        while not self._twins and self.look_at_next():
             pass
-        return self._twins / self._looked_at if self._looked_at else 1.0
+        return self._twins > 0 or not self._looked_at
 
     def look_at_next(self) -> bool:
         """Look at one slice more; False where there is none."""
@@ -285,13 +333,14 @@ class _TwinSample:
             return False
         shown = self._rng.permutation(np.flatnonzero(seen))[: self._rods]
         points_mm = cut(self._frame, rotation, translation).points_mm[shown]
-        spots = Spots.of(points_mm, np.tile(self._sigma_mm**2 * np.eye(2), (self._rods, 1, 1)), None)
+        noise_mm2 = np.tile(self._sigma_mm**2 * np.eye(2), (self._rods, 1, 1))
+        spots = Spots.of(points_mm, noise_mm2, None, Tolerances.none(self._frame))
         search = _Search(spots, self._frame, Prior(np.eye(3), math.pi), RegistrationOptions())
         self._looked_at += 1
         try:
             near = [one for one in search.level(self._rods, math.inf, []) if one.chi_square < _NEAR_TWIN]
             self._twins += len(distinct(near, spots.gains(self._frame))) > 1
-        except _TooMuchWorkError:
+        except SearchGivenUpError:
             self._twins += 1  # For all that is known.
         return True
 

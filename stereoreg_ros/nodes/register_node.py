@@ -189,8 +189,8 @@ class RegisterNode(Node):
             self._refuse_unusable("bad_image", f"internal error: {type(error).__name__}: {error}", header, started)
             return
         if len(results[0].spots_px) >= self.settings.options.min_inliers:
-            sighting = sighting_of(results[0], ct_slice.hu.size, ct_slice.scanner_from_slice)
-            self._scale.sightings.append(sighting)
+            plane, stated = ct_slice.scanner_from_slice, unregistered.spacing
+            self._scale.sightings.append(sighting_of(results[0], ct_slice.hu.size, plane, stated))
         for output, result in zip(self._outputs, results, strict=True):
             output.publish(result, header, came_s, self._axes_of(output.frame), self._send_transform)
         self._publish_statuses(statuses, header)

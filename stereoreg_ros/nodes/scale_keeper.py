@@ -45,7 +45,7 @@ class _Registering(Protocol):
 class ScaleKeeper:
     """The services `~/recalibrate` and `~/reset_calibration`, and where the scale in use comes from.
 
-    source: `configured` or `measured`; covariance: of a measured scale, a configured one is taken to be exact.
+    source: `configured` or `measured`; covariance: of a measured scale, None of one that is known to `scale_tolerance`.
     """
 
     def __init__(self, node: Node, registering: _Registering) -> None:

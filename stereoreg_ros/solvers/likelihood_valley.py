@@ -28,20 +28,29 @@ _FLOOR = 1e-12
 
 
 def covariance_along_valley(
-    frame: Frame, slice_from_frame: Pose, lines: NDArray[np.intp], spots_mm: Array, whitening: Array
+    frame: Frame,
+    slice_from_frame: Pose,
+    lines: NDArray[np.intp],
+    spots_mm: Array,
+    whitening: Array,
+    common: Array | None = None,
 ) -> Array:
     """Covariance (6, 6) of slice_from_frame (mm, rad; see `Pose.perturbed`), which is the maximum-likelihood solution.
 
     spots_mm (k, 2), whitening (k, 2, 2) 1/mm: of the given rods (k,); whitening turns a residual in mm into one of unit
-    variance.
+    variance; common (k, 2, c) mm: errors that all spots share, as in `maximum_likelihood.refine`.
     """
     rotation, translation = slice_from_frame.rotation, slice_from_frame.translation
     target, used = np.zeros((2, len(frame), 2)), np.zeros((2, len(frame)), dtype=bool)
     weights = np.zeros((2, len(frame), 2, 2))
     target[:, lines], used[:, lines], weights[:, lines] = spots_mm, True, whitening
+    shared = None
+    if common is not None:
+        shared = np.zeros((2, len(frame), *common.shape[1:]))
+        shared[:, lines] = common
 
     def at(rotations: Array, translations: Array) -> Evaluated:
-        return evaluate(frame, rotations, translations, target, used, weights)
+        return evaluate(frame, rotations, translations, target, used, weights, shared)
 
     state = at(np.stack([rotation, rotation]), np.stack([translation, translation]))
     lowest = state.chi_square

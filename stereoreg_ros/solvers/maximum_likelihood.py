@@ -60,16 +60,19 @@ def refine(
     used: NDArray[np.bool_],
     whitening: Array,
     iterations: int = 30,
+    common: Array | None = None,
 ) -> Refined:
     """Refine m poses slice_from_frame by Levenberg-Marquardt on the residuals in the slice.
 
     rotations (m, 3, 3), translations (m, 3) mm: where to start. spots_mm (m, n, 2): the spot of each rod, in mm in the
     slice, anything where used (m, n) is false. whitening, (m, n, 2, 2) or (2, 2) for all alike, 1/mm: turns a residual
-    in mm into one of unit variance, S^-1 / sigma for isotropic noise of sigma pixel.
+    in mm into one of unit variance, S^-1 / sigma for isotropic noise of sigma pixel. common: (m, n, 2, k) mm, errors
+    that all spots share: how far each spot moves by one standard deviation of each of k of them. The likelihood is that
+    with these errors integrated out; chi_square and information are those of that likelihood.
     """
     m = len(rotations)
     target = np.where(used[..., None], spots_mm, 0.0)
-    state = evaluate(frame, rotations, translations, target, used, whitening)
+    state = evaluate(frame, rotations, translations, target, used, whitening, common)
     # Where poses at rest are written to; the others go on among themselves.
     ended = Evaluated(*(part.copy() for part in state))
     converged = np.zeros(m, dtype=bool)
@@ -82,7 +85,7 @@ def refine(
         diagonal += damping[:, None] * diagonal + (1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-12)
         step: Array = np.linalg.solve(damped, state.gradient[..., None])[..., 0].astype(np.float64, copy=False)
         turned = rotation_exp(step[:, 3:]) @ state.rotations
-        tried = evaluate(frame, turned, state.translations + step[:, :3], target, used, whitening)
+        tried = evaluate(frame, turned, state.translations + step[:, :3], target, used, whitening, common)
         old = state.chi_square
         # A pose that loses a cut has NaN here, which is not better.
         better = tried.chi_square <= old
@@ -102,6 +105,7 @@ def refine(
             going = ~resting
             rows, damping, target, used = rows[going], damping[going], target[going], used[going]
             whitening = whitening[going]
+            common = None if common is None else common[going]
             state = Evaluated(*(part[going] for part in state))
     cuts = cut(frame, ended.rotations, ended.translations)
     return Refined(ended.rotations, ended.translations, ended.chi_square, ended.information, converged, cuts)
@@ -168,6 +172,7 @@ def evaluate(
     target: Array,
     used: NDArray[np.bool_],
     whitening: Array,
+    common: Array | None = None,
 ) -> Evaluated:
     """Chi-square and its slope at poses slice_from_frame; arguments as in `refine`, without its broadcasting."""
     m, n = used.shape
@@ -179,4 +184,15 @@ def evaluate(
     flat = np.where(mask[..., None], jacobian, 0.0).reshape(m, 2 * n, 6)
     turned = np.swapaxes(flat, 1, 2)
     chi_square = np.einsum("mki,mki->m", residual, residual)
-    return Evaluated(rotations, translations, chi_square, turned @ flat, (turned @ residual)[..., 0])
+    information, gradient = turned @ flat, turned @ residual
+    if common is not None:
+        # The covariance of all residuals is I + N N', whose inverse is I - N (I + N'N)^-1 N' (Woodbury).
+        moved = np.where(mask[..., None], whitening @ common, 0.0).reshape(m, 2 * n, -1)
+        moved_turned = np.swapaxes(moved, 1, 2)
+        inner = np.linalg.inv(np.eye(moved.shape[2]) + moved_turned @ moved)
+        by_pose, by_residual = moved_turned @ flat, moved_turned @ residual
+        shared = inner @ by_residual
+        information = information - np.swapaxes(by_pose, 1, 2) @ inner @ by_pose
+        gradient = gradient - np.swapaxes(by_pose, 1, 2) @ shared
+        chi_square = chi_square - np.einsum("mki,mki->m", by_residual, shared)
+    return Evaluated(rotations, translations, chi_square, information, gradient[..., 0])

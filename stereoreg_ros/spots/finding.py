@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.options import AUTO, RegistrationOptions
-from stereoreg_ros.spots.regions import Regions, regions_above, regions_by_contrast
+from stereoreg_ros.spots.choice import worth_matching
+from stereoreg_ros.spots.contrast import Standing, regions_by_contrast
+from stereoreg_ros.spots.regions import Regions, regions_above
 from stereoreg_ros.spots.symmetry import centres_of_symmetry
 
 # A spot's outline lies at this height between its surroundings and its peak: what is above it gives the first centre.
@@ -28,6 +30,8 @@ _SIDES: Final = (13, 19, 27, 39, 55, 101)
 _MARGIN: Final = 4
 # A centre that is not known to a pixel is none: what it belongs to looks little like a rod.
 _LARGEST_STD_PX: Final = 0.8
+# So many times it is chosen anew where things without a centre were among the chosen.
+_CHOICES: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +66,39 @@ def find_spots(ct_slice: Slice, options: RegistrationOptions) -> FoundSpots:
     pixel_mm2 = ct_slice.scale.sx * ct_slice.scale.sy
     fewest, most = options.min_spot_area_mm2 / pixel_mm2, options.max_spot_area_mm2 / pixel_mm2
     if options.threshold == AUTO:
-        regions = regions_by_contrast(ct_slice.hu, fewest, most, options.min_inliers)
+        found = _standing_out(ct_slice.hu, regions_by_contrast(ct_slice.hu, fewest, most), options.min_inliers)
     else:
         regions = regions_above(ct_slice.hu, float(options.threshold), fewest, most)
+        found, _ = _centred(ct_slice.hu, regions)
+    return found.take(np.lexsort((found.centres_px[:, 0], found.centres_px[:, 1])))
+
+
+def _standing_out(hu: NDArray[np.float32], standing: Standing, least_rods: int) -> FoundSpots:
+    """The spots of those regions that are worth matching."""
+    left = np.arange(len(standing.height))
+    for _ in range(_CHOICES):
+        chosen = left[worth_matching(standing.height[left], standing.noise[left], least_rods)]
+        found, known = _centred(hu, standing.regions.take(chosen))
+        if known.all():
+            break
+        # What has no centre is no rod, and says nothing of how bright they are.
+        left = np.setdiff1d(left, chosen[~known])
+    return found
+
+
+def _centred(hu: NDArray[np.float32], regions: Regions) -> tuple[FoundSpots, NDArray[np.bool_]]:
+    """The spots of regions, those that have a centre, and which of the regions (n,) do."""
     width, height = regions.extent.T
     wanted = np.maximum(width, height) + 2 * _MARGIN
-    side = np.array([*_SIDES, np.iinfo(np.intp).max])[np.searchsorted(_SIDES, wanted)]
-    parts = [_measured(ct_slice.hu, regions.take(side == one), one) for one in _SIDES if (side == one).any()]
+    which = np.zeros(len(wanted), dtype=bool)
+    groups = [np.flatnonzero(np.searchsorted(_SIDES, wanted) == group) for group in range(len(_SIDES))]
+    parts = [_measured(hu, regions.take(rows), side) for rows, side in zip(groups, _SIDES, strict=True) if len(rows)]
     if not parts:
-        return FoundSpots(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.zeros(0, dtype=bool))
+        return FoundSpots(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), which[:0]), which
     found = FoundSpots(*(np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(FoundSpots)))
-    found = found.take(np.linalg.eigvalsh(found.covariances_px2)[:, -1] <= _LARGEST_STD_PX**2)
-    return found.take(np.lexsort((found.centres_px[:, 0], found.centres_px[:, 1])))
+    known = np.linalg.eigvalsh(found.covariances_px2)[:, -1] <= _LARGEST_STD_PX**2
+    which[np.concatenate(groups)[known]] = True
+    return found.take(known), which
 
 
 def _measured(hu: NDArray[np.float32], regions: Regions, side: int) -> FoundSpots:
