@@ -62,9 +62,7 @@ def main() -> int:
             flush=True,
         )
     print("\nguess: near = the pose before, 2 mm and 1 degree off; any = the frame turned in any way")
-    print(
-        "weak: accepted with a caution, off by more than 2 mm or 3 degrees, but no more than the stated covariance says"
-    )
+    print("weak: accepted, off by more than 2 mm or 3 degrees, but no more than the stated covariance says")
     baselines = []
     for false_spots in BASELINE_FALSE_SPOTS:
         baseline = measure_baseline(false_spots, arguments.baseline_samples)

@@ -24,21 +24,33 @@ _STEEL_PER_MM = np.array([0.95, 0.40, 0.21])
 _PHOTONS = 2e6
 _FINE = 2  # so many pixels of the phantom to one of the picture
 _SUPERSAMPLED = 8
+_POST_MM = 12.0
 
 
 def scanned_rods(
-    rng: np.random.Generator, rods: int, diameter_mm: float, side: int = 192, spacing_mm: float = 0.5
+    rng: np.random.Generator,
+    rods: int,
+    diameter_mm: float,
+    posts: int = 0,
+    side: int = 192,
+    spacing_mm: float = 0.5,
 ) -> tuple[Slice, Array]:
-    """A slice in HU, and the true centres (rods, 2) in pixel: rods of steel at random places, 8 mm apart or more."""
+    """A slice in HU, and the true centres (rods, 2) in pixel: rods of steel at random places, and so many posts of
+    steel, too thick for spots, all with 7 mm or more between them.
+    """
     fine, pixel_mm = side * _FINE, spacing_mm / _FINE
     radius_mm = 0.45 * side * spacing_mm
-    centres_mm: list[Array] = []
-    while len(centres_mm) < rods:
+    placed: list[Array] = []
+    thickness_mm = posts * [_POST_MM] + rods * [diameter_mm]
+    while len(placed) < posts + rods:
         place = rng.uniform(-0.75 * radius_mm, 0.75 * radius_mm, 2)
-        apart = all(np.linalg.norm(place - other) >= 8.0 for other in centres_mm)
+        least = [7.0 + 0.5 * (thickness_mm[len(placed)] + other) for other in thickness_mm[: len(placed)]]
+        apart = all(np.linalg.norm(place - other) >= gap for other, gap in zip(placed, least, strict=True))
         if apart and np.linalg.norm(place) <= 0.8 * radius_mm:
-            centres_mm.append(place)
-    steel = sum((_disc(fine, pixel_mm, centre, diameter_mm / 2) for centre in centres_mm), np.zeros((fine, fine)))
+            placed.append(place)
+    discs = (_disc(fine, pixel_mm, place, thick / 2) for place, thick in zip(placed, thickness_mm, strict=True))
+    steel = sum(discs, np.zeros((fine, fine)))
+    centres_mm = placed[posts:]
     water = _disc(fine, pixel_mm, np.zeros(2), radius_mm) - steel
     angles = np.linspace(0.0, 180.0, 720, endpoint=False)
     through_water, through_steel = (radon(part, angles, circle=True) * pixel_mm for part in (water, steel))
@@ -79,12 +91,14 @@ def _disc(side: int, pixel_mm: float, centre_mm: Array, radius_mm: float) -> Arr
     return inside
 
 
-def measure(slices: int, rods: int, diameter_mm: float, threshold: float | str) -> tuple[int, int, float, float]:
+def measure(
+    slices: int, rods: int, diameter_mm: float, threshold: float | str, posts: int = 0
+) -> tuple[int, int, float, float]:
     """Rods found, rods there, and root mean square and largest error of their centres per axis, pixel."""
     rng = np.random.default_rng(0)
     errors = []
     for _ in range(slices):
-        ct_slice, centres = scanned_rods(rng, rods, diameter_mm)
+        ct_slice, centres = scanned_rods(rng, rods, diameter_mm, posts)
         found = find_spots(ct_slice, RegistrationOptions(threshold=threshold)).centres_px
         for centre in centres:
             off = found - centre

@@ -32,7 +32,8 @@ _BATCH = 250
 class Clutter:
     """Sets of nothing but false spots, uniform over a square of `side_mm`, from `fewest` to `most` of them.
 
-    noise_px: that the matcher is told; max_log10: how many false alarms it may let pass, as log10.
+    noise_px: that the matcher is told; max_log10: how many false alarms it may let pass, as log10; tolerance_mm,
+    scale_tolerance: of the frame and the scale, as the matcher is told.
     """
 
     frame: str
@@ -41,6 +42,8 @@ class Clutter:
     side_mm: float
     noise_px: float
     max_log10: float
+    tolerance_mm: float = 0.0
+    scale_tolerance: float = 0.0
 
 
 @dataclass
@@ -58,7 +61,14 @@ def count(clutter: Clutter, sets: int, seed: int) -> Count:
     cv2.setNumThreads(1)
     rng = np.random.default_rng(seed)
     frame, scale = load_frame(clutter.frame), ScannerSettings().scale
-    options = RegistrationOptions(spot_noise_px=clutter.noise_px, max_log10_false_alarms=clutter.max_log10)
+    # The theory counts what chance brings however weak the pose.
+    options = RegistrationOptions(
+        spot_noise_px=clutter.noise_px,
+        frame_tolerance_mm=clutter.tolerance_mm,
+        scale_tolerance=clutter.scale_tolerance,
+        max_log10_false_alarms=clutter.max_log10,
+        max_target_error_mm=1000.0,
+    )
     accepted = 0
     below = dict.fromkeys(THRESHOLDS, 0)
     reasons: Counter[str] = Counter()
@@ -112,6 +122,7 @@ def main() -> int:
     for clutter in (
         Clutter("cube6", 8, 20, 256.0, 0.3, 0.0),
         Clutter("cube6", 15, 25, 120.0, 0.3, 0.0),
+        Clutter("cube6", 8, 16, 256.0, 0.3, 0.0, 0.5, 0.005),
         Clutter("zframe", 8, 16, 150.0, 0.3, 0.0),
         Clutter("leksell_ct", 8, 14, 256.0, 0.3, 0.0),
     ):
@@ -123,7 +134,8 @@ def main() -> int:
             # Three standard deviations of a count of that mean.
             failed |= number > most + 3 * most**0.5 + 1
             row += f"{number:>6d} /{most:6.4g}"
-        print(f"{clutter.frame:12s} {clutter.fewest:>3d}-{clutter.most:<3d}  {row}", flush=True)
+        tolerance = f"  tolerance {clutter.tolerance_mm:g} mm" if clutter.tolerance_mm else ""
+        print(f"{clutter.frame:12s} {clutter.fewest:>3d}-{clutter.most:<3d}  {row}{tolerance}", flush=True)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(json.dumps(records, indent=1) + "\n")
     print(f"\nas JSON: {arguments.output}")

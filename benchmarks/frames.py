@@ -44,7 +44,12 @@ def main() -> int:
                 for part in np.array_split(drawn, max(1, len(drawn) // 100))
             ]
         )
-        options = RegistrationOptions(spot_noise_px=IMAGING.noise_px, slice_thickness_mm=IMAGING.thickness_mm)
+        options = RegistrationOptions(
+            spot_noise_px=IMAGING.noise_px,
+            frame_tolerance_mm=0.0,
+            scale_tolerance=0.0,
+            slice_thickness_mm=IMAGING.thickness_mm,
+        )
         poses = meetings(arguments.poses, 7, np.zeros(3), np.array([-HEIGHT_MM, HEIGHT_MM]), TILT_DEG)
         left_out: list[int | None] = [None, *range(len(frame))]
         tried = trials(frame, poses, SCALE, options, left_out, np.random.default_rng(1))

@@ -14,7 +14,7 @@ import os
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -37,6 +37,7 @@ _BATCH = 250
 # The ball holds 95 % of the errors, give or take so many, of spot sets and of rendered slices.
 _SPOTS_SLACK, _RENDERED_SLACK = 0.01, 0.02
 # Standard errors of the measured scale, mm/pixel, and their correlation, where a case has them.
+_PERFECT = RegistrationOptions(frame_tolerance_mm=0.0, scale_tolerance=0.0, max_target_error_mm=1000.0)
 _SCALE_COVARIANCE = 0.0004**2 * np.array([[1.0, 0.4], [0.4, 1.0]])
 
 
@@ -115,8 +116,8 @@ def measure_spot_sets(case: Case, sets: int, seed: int) -> PoseStatistics:
     frame, scanner = case.make_frame(), ScannerSettings()
     true_scale, area_mm2 = scanner.scale, float(np.prod(scanner.size_mm))
     # With covariances of the spots' own, the floor is below them all.
-    options = RegistrationOptions(
-        spot_noise_px=0.04 if case.mixed else case.noise_px, max_rotation_deg=case.max_rotation_deg
+    options = replace(
+        _PERFECT, spot_noise_px=0.04 if case.mixed else case.noise_px, max_rotation_deg=case.max_rotation_deg
     )
     statistics = PoseStatistics()
     for _ in range(sets):
@@ -148,7 +149,7 @@ def measure_rendered(case: Case, slices: int, seed: int) -> PoseStatistics:
     rng = np.random.default_rng(seed)
     frame, scanner = case.make_frame(), ScannerSettings(shape=(384, 384), noise_hu=case.image_noise_hu)
     # Far below what the spots' own covariances are, which is what is measured here.
-    options = RegistrationOptions(spot_noise_px=0.001, max_rotation_deg=case.max_rotation_deg)
+    options = replace(_PERFECT, spot_noise_px=0.001, max_rotation_deg=case.max_rotation_deg)
     statistics = PoseStatistics()
     for _ in range(slices):
         pose = random_pose(rng, frame, scanner)

@@ -119,7 +119,7 @@ class ReasonTable(_Table):
     """The reasons of a refusal; their meanings from the README's table."""
 
     def run(self) -> list[nodes.Node]:
-        texts = {row[0].strip("`"): row[1:] for row in _readme_rows(3)}
+        texts = {row[0].strip("`"): [_of_this_site(text) for text in row[1:]] for row in _readme_rows(3)}
         self.check(REASONS, {name: text[0] for name, text in texts.items()})
         return self.table(
             ("reason", "meaning", "what helps"), [(f"`{name}`", *texts.get(name, ("", ""))) for name in REASONS]

@@ -23,7 +23,11 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "frame_file", default_value="cube6", description="frame file: a path, or the name of a shipped frame"
             ),
-            DeclareLaunchArgument("params_file", default_value="", description="parameter file of register_node"),
+            DeclareLaunchArgument(
+                "params_file",
+                default_value=PathJoinSubstitution([ThisLaunchFileDir(), "demo.yaml"]),
+                description="parameter file of register_node",
+            ),
             DeclareLaunchArgument("namespace", default_value="", description="namespace of nodes and topics"),
             DeclareLaunchArgument(
                 "publish_tf",

@@ -124,8 +124,8 @@ def calibrate(
     scale: the one in use, mm/pixel; where it leaves slices unexplained, others are tried. What came with the slices
     themselves (`Sighting.stated`) is known far better than what somebody typed in, and is changed by far less: see
     `CalibrationOptions.calibration_max_change`. The rods are where `frame` has them within their tolerances, those of
-    the frame or `frame_tolerance_mm`; a frame of another size altogether looks like another scale. progress: told the
-    share of the scales that was tried, says whether to go on; where not, the calibration is refused.
+    the frame or `frame_tolerance_mm`; a frame of another size altogether looks like another scale. progress: called
+    with the share of the scales that was tried, says whether to go on; where not, the calibration is refused.
     """
     options, calibration = options or RegistrationOptions(), calibration or CalibrationOptions()
     if not sightings:
@@ -275,7 +275,7 @@ def _search(
 
     With a scale that is a little off, a slice is recognised at a noise that allows for that; the scale is then measured
     from it, and the slice must be accepted with it at the noise that is stated, as rarely by chance as all scales tried
-    require. The scales nearest to the configured one come first.
+    require. The scales nearest to the one in use come first.
     """
     waiting = list(sightings[-_SEARCHED:])
     factors = _factors(_reach(calibration))
@@ -402,7 +402,7 @@ def _judged(
         origin = "came with the slices" if stated is not None else "is in use"
         return CalibrationRefusal(
             f"calibration refused: scanner, or frame file? The pixel spacing that {origin} is ({reference.sx:.4f}, "
-            f"{reference.sy:.4f}) mm/pixel, measured is {measured}: {100 * change:.1f} % off, more than "
+            f"{reference.sy:.4f}) mm/pixel, the one measured is {measured}: {100 * change:.1f} % off, more than "
             f"{100 * limit:.3g} %; if the first is right, the frame {size}. {_NOT_TOLD_APART}, and {of_frame}; measure "
             "the frame, or set calibration_max_change to allow such a change"
         )
@@ -479,7 +479,12 @@ def _other_size(stated: PixelScale, measured: PixelScale, errors: Sequence[float
     by_x, by_y = 100 * (stated.sx / measured.sx - 1), 100 * (stated.sy / measured.sy - 1)
     apart = math.hypot(100 * errors[0] / measured.sx, 100 * errors[1] / measured.sy)
     if abs(by_x - by_y) <= _APART * apart + 0.05:
-        return f"would have to be {_larger(0.5 * (by_x + by_y))} than its file says"
+        both = 0.5 * (by_x + by_y)
+        return (
+            "is as large as its file says"
+            if abs(both) < 0.05
+            else f"would have to be {_larger(both)} than its file says"
+        )
     return (
         f"would have to be {_larger(by_x)} along the rows and {_larger(by_y)} along the columns than its file says, "
         "which no other size of it is"

@@ -28,8 +28,8 @@ _IMPLAUSIBLE, _DOUBTFUL = 0.01, 0.05
 # Of a scale that fits the spots so much better than the stated one.
 _SCALE_IMPLAUSIBLE = 5e-3
 # Log-likelihood by which unmatched spots beside rods that must show, and have none, may speak against a pose: one frame
-# in three hundred is taken not to be as it was described.
-_MOST_NEAR_MISSES = math.log(300.0)
+# in a thousand is taken not to be as it was described.
+_MOST_NEAR_MISSES = math.log(1000.0)
 # Poses whose rotations differ by less cannot be told apart by a nominal orientation.
 _SAME_ORIENTATION_DEG = 10.0
 # Of several poses, how many a sentence lists.

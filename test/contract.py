@@ -22,6 +22,18 @@ DIAGNOSTIC_KEYS = [
     "duration_ms",
 ]
 
+REASONS = [
+    "too_few_spots",
+    "no_consensus",
+    "ambiguous",
+    "degenerate",
+    "inaccurate",
+    "contradicted",
+    "bad_image",
+    "bad_frame",
+    "skipped",
+]
+
 PUBLISHED = {
     "pose": "geometry_msgs/msg/PoseStamped",
     "pose_with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",

@@ -15,8 +15,9 @@ from benchmarks.clutter import THRESHOLDS, Clutter, count
         (Clutter("cube6", 10, 14, 90.0, 0.3, 0.0), 60),
         (Clutter("zframe", 8, 12, 120.0, 0.3, 0.0), 60),
         (Clutter("leksell_ct", 8, 12, 256.0, 0.3, 0.0), 60),
+        (Clutter("cube6", 8, 12, 256.0, 0.3, 0.0, tolerance_mm=0.5, scale_tolerance=0.005), 60),
     ],
-    ids=lambda value: getattr(value, "frame", ""),
+    ids=lambda value: f"{value.frame}, {value.tolerance_mm} mm" if isinstance(value, Clutter) else "",
 )
 def test_no_more_than_expected(clutter: Clutter, sets: int) -> None:
     result = count(clutter, sets, seed=4)

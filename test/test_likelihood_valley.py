@@ -52,6 +52,22 @@ def test_of_a_straight_valley_it_is_the_inverse_of_the_information(noise_px):
     np.testing.assert_allclose(shares, 1.0, atol=0.02)
 
 
+def test_errors_that_spots_share_widen_it():
+    """As they do the information, of which it is the inverse where the valley is straight."""
+    frame, pose, noise_px = load_frame("cube6"), Pose(np.eye(3), np.array([40.0, 50.0, 4.0])), 0.01
+    spots_px, _ = project(frame, pose, SCALE)
+    spots_mm = SCALE.to_mm(spots_px)
+    whitening = np.tile(SCALE.inverse_matrix / noise_px, (6, 1, 1))
+    off = spots_mm - spots_mm.mean(axis=0)
+    common = 0.01 * np.stack([off * [1, 0], off * [0, 1]], axis=-1)
+    rotations, translations, used = pose.rotation[None], pose.translation[None], np.ones((1, 6), dtype=bool)
+    found = refine(frame, rotations, translations, spots_mm[None], used, whitening[None], 100, common[None])
+    covariance = covariance_along_valley(frame, pose, ALL_SIX, spots_mm, whitening, common)
+    np.testing.assert_allclose(np.linalg.eigvals(covariance @ found.information[0]).real, 1.0, atol=0.02)
+    without = covariance_along_valley(frame, pose, ALL_SIX, spots_mm, whitening)
+    assert np.linalg.eigvalsh(covariance - without)[-1] > 0.2 * np.linalg.eigvalsh(without)[-1]
+
+
 def test_of_four_rods_it_is_the_mean_squared_error():
     """Over even poses, as it supposes. The inverse of the information holds no more than the bottom of the valley."""
     along, at_bottom = [], []
@@ -84,7 +100,15 @@ def test_the_registration_states_it():
     """A pose of a four-rod frame at which the bottom of the valley tells too little."""
     frame, rng = four_rods(100), np.random.default_rng(3)
     poses = meetings(60, 3, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
-    options = RegistrationOptions(max_log10_false_alarms=-4.0)
+    options = RegistrationOptions(
+        frame_tolerance_mm=0.0,
+        scale_tolerance=0.0,
+        # No rod ends within so thin a slice.
+        slice_thickness_mm=0.01,
+        max_rotation_deg=60.0,
+        max_log10_false_alarms=-4.0,
+        max_target_error_mm=1000.0,
+    )
     ratios = []
     for row in range(len(poses)):
         spots_px, cuts = project(frame, poses.pose(row), SCALE)
@@ -94,6 +118,7 @@ def test_the_registration_states_it():
         result = register_spots(noisy, frame, SCALE, options, slice_area_mm2=65536.0)
         if not result or not result.caution:
             continue
+        assert "weakly determined" in result.caution or "is large for" in result.caution
         estimate = result.estimate
         lines = np.array([match.line_index for match in estimate.matches])
         spots_mm = SCALE.to_mm(np.array([match.spot_px for match in estimate.matches]))

@@ -37,24 +37,17 @@ def accepted(kind: str, frame: str, index: int) -> Registration:
 @pytest.mark.parametrize(
     ("kind", "frame", "scenes"),
     [
-        ("half_turn", "cube8", 25),
-        ("half_turn", "zframe", 8),
-        ("half_turn", "leksell_ct9", 5),
-        ("quarter_turn", "zframe", 8),
-        ("spacing", "cube6", 20),
-        ("spacing", "cube8", 20),
-        ("spacing_prior", "zframe", 15),
-        ("rod_ends", "cube6", 15),
-        ("rod_ends_prior", "zframe", 15),
-        ("rod_ends_prior", "leksell_ct9", 10),
-        ("mirrored_rod", "cube6", 15),
-        ("template_prior", "zframe", 15),
-        ("sister", "zframe", 10),
-        ("sister_missing", "cube6", 8),
-        ("sister_missing", "leksell_ct9", 5),
-        ("fragments", "cube6", 20),
-        ("fragments_alone", "zframe", 12),
-        ("collinear_missing", "cube6", 12),
+        ("half_turn", "cube8", 20),
+        ("half_turn", "zframe", 5),
+        ("half_turn", "leksell_ct9", 4),
+        ("spacing", "cube8", 12),
+        ("rod_ends", "cube6", 10),
+        ("rod_ends_prior", "zframe", 10),
+        ("mirrored_rod", "cube6", 8),
+        ("template_prior", "zframe", 12),
+        ("sister_missing", "cube6", 6),
+        ("fragments", "cube6", 12),
+        ("collinear_missing", "cube6", 8),
     ],
 )
 def test_none_is_wrong(kind: str, frame: str, scenes: int) -> None:
@@ -63,21 +56,22 @@ def test_none_is_wrong(kind: str, frame: str, scenes: int) -> None:
     assert not wrong, f"describe one: python -m benchmarks.mistakes --kinds {kind} --frames {frame} --scene INDEX"
 
 
-@pytest.mark.parametrize("frame", ["cube6", "cube8", "zframe", "leksell_ct9"])
-@pytest.mark.parametrize("kind", ["true", "as_built"])
+@pytest.mark.parametrize(
+    ("kind", "frame"), [("true", "cube6"), ("true", "zframe"), ("as_built", "cube8"), ("as_built", "leksell_ct9")]
+)
 def test_true_scenes_are_accepted(kind: str, frame: str) -> None:
     row = row_of(kind, frame, measure(kind, frame, 0, 12))
     assert row.wrong == 0
     assert row.right + row.weak >= 11, row.refused
 
 
-@pytest.mark.parametrize("kind", ["perfect", "small_rod_ends", "small_both"])
+@pytest.mark.parametrize("kind", ["perfect", "small_both"])
 def test_stated_errors(kind: str) -> None:
-    row = row_of(kind, "cube8", measure(kind, "cube8", 0, 80))
+    row = row_of(kind, "cube8", measure(kind, "cube8", 0, 60))
     assert row.nees is not None
-    # The mean of 80 chi-squares of six degrees of freedom has a standard deviation of 0.4.
+    # The mean of 60 chi-squares of six degrees of freedom has a standard deviation of 0.45.
     assert 4.0 <= row.nees <= 9.0
-    assert row.right >= 76, row.refused
+    assert row.right >= 57, row.refused
 
 
 @pytest.mark.skipif(not CASES.exists(), reason=f"{CASES} is not there")

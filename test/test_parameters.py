@@ -12,7 +12,7 @@ import yaml
 from stereoreg_ros.nodes import reception_parameters
 from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
 from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
-from stereoreg_ros.options import MATCHERS, RegistrationOptions
+from stereoreg_ros.options import MATCHERS, CalibrationOptions, RegistrationOptions
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 DEFAULTS = {entry.name: entry.default for entry in ENTRIES}
@@ -25,6 +25,8 @@ CONTRACT = {
     "rescale_intercept",
     "threshold",
     "spot_noise_px",
+    "frame_tolerance_mm",
+    "scale_tolerance",
     "min_inliers",
     "matcher",
     "max_log10_false_alarms",
@@ -33,12 +35,14 @@ CONTRACT = {
     "scanner_frame_id",
     "fiducial_frame_id",
     "max_position_std_mm",
+    "max_target_error_mm",
 }
 
 
 def test_table_holds_the_contract_and_every_option():
     assert set(DEFAULTS) >= CONTRACT
-    assert set(DEFAULTS) >= {field.name for field in fields(RegistrationOptions)}
+    for options in (RegistrationOptions, CalibrationOptions):
+        assert set(DEFAULTS) >= {field.name for field in fields(options)}
     assert len(DEFAULTS) == len(ENTRIES)
 
 
@@ -81,9 +85,10 @@ def test_defaults_are_valid_and_know_no_spacing():
 
 
 def test_values_reach_their_places():
-    changed = {**DEFAULTS, "pixel_spacing": (0.5, 0.7), "pixel_shear": 0.01, "threshold": 1500.0}
+    options = {"threshold": 1500.0, "frame_tolerance_mm": 0.4, "scale_tolerance": 0.01, "max_target_error_mm": 5.0}
+    changed = {**DEFAULTS, "pixel_spacing": (0.5, 0.7), "pixel_shear": 0.01, **options}
     settings = NodeSettings.from_parameters(changed)
-    assert settings.options.threshold == 1500.0
+    assert settings.options == RegistrationOptions(**options)
     assert settings.scale is not None
     assert (settings.scale.sx, settings.scale.sy, settings.scale.shear) == (0.5, 0.7, 0.01)
 
@@ -104,6 +109,10 @@ def test_values_reach_their_places():
         ("matcher", "guess", "matcher is 'guess', expected one of"),
         ("nominal_orientation", (0.0, 0.0, 1.0), "nominal_orientation: .*expected \\(4,\\)"),
         ("nominal_orientation", (0.0, 0.0, 0.0, 0.0), "nominal_orientation: .*no length"),
+        ("frame_tolerance_mm", -0.1, "frame_tolerance_mm is -0.1, expected a number from 0 to 10"),
+        ("frame_tolerance_mm", math.nan, "frame_tolerance_mm is nan, expected a number from 0 to 10"),
+        ("scale_tolerance", 0.2, "scale_tolerance is 0.2, expected a number from 0 to 0.1"),
+        ("scale_tolerance", math.inf, "scale_tolerance is inf, expected a number from 0 to 0.1"),
         ("min_spot_area_mm2", 90.0, "min_spot_area_mm2 is 90, expected less than max_spot_area_mm2"),
     ],
 )

@@ -107,7 +107,7 @@ def test_spacing_that_came_with_the_slices_is_not_made_to_fit_the_frame(client):
         response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
         assert not response.success
         assert "scanner, or frame file?" in response.message
-        assert "came with the slices is (0.5000, 0.6000) mm/pixel, measured is (0.48" in response.message
+        assert "came with the slices is (0.5000, 0.6000) mm/pixel, the one measured is (0.48" in response.message
         assert re.search(r"would have to be (2\.[5-9]|3\.[0-5]) % larger than its file says", response.message)
         assert "cannot be told apart" in response.message
         assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == [SCALE.sx, SCALE.sy]

@@ -29,6 +29,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from stereoreg_ros import PixelScale, Pose, load_frame
+from stereoreg_ros.geometry.frame_file import shipped_frames
 from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
 from stereoreg_ros.nodes import conversions, register_node
 from stereoreg_ros.nodes.parameters import ENTRIES
@@ -195,6 +196,7 @@ def bench(running) -> Iterator[Bench]:
 
 
 def test_pose_covariance_and_diagnostics(bench):
+    assert bench.set(max_rotation_deg=40.0) == ""
     hu, slice_from_frame = rendered(2)
     stamp = bench.send(image_of(hu))
     assert_near(bench.pose(stamp), slice_from_frame)
@@ -220,6 +222,16 @@ def test_pose_covariance_and_diagnostics(bench):
     assert float(values["duration_ms"]) > 0
     worst_mm = 1e3 * math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     assert float(values["position_std_mm"]) == pytest.approx(worst_mm, rel=1e-6)
+
+
+def test_a_pose_without_a_configured_orientation_bears_a_caution(bench):
+    hu, slice_from_frame = rendered(2)
+    stamp = bench.send(image_of(hu))
+    assert_near(bench.pose(stamp), slice_from_frame)
+    status = bench.status(stamp)
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message.startswith("registered 6 of 6 rods, residual 0.")
+    assert "no nominal orientation is configured" in status.message
 
 
 @pytest.mark.parametrize(
@@ -308,6 +320,9 @@ def test_image_that_is_not_finite_is_refused(bench, value):
         ({"threshold": "loud"}, "threshold is 'loud', expected a number from -32768 to 65535, or 'auto'"),
         ({"threshold": [1.0]}, "threshold is (1.0,), expected a number"),
         ({"threshold": True}, "threshold is True, expected a number"),
+        ({"frame_tolerance_mm": -0.1}, "frame_tolerance_mm out of range"),
+        ({"scale_tolerance": 0.2}, "scale_tolerance out of range"),
+        ({"max_target_error_mm": math.nan}, "max_target_error_mm out of range"),
         ({"rescale_slope": 0.0}, "rescale_slope is 0.0, expected a number that is not 0"),
         ({"matcher": "guess"}, "matcher is 'guess', expected one of"),
         ({"nominal_orientation": [0.0, 0.0, 0.0, 0.0]}, "nominal_orientation"),
@@ -451,7 +466,8 @@ def test_recalibrate_and_reset(bench):
 
 def test_recalibrate_refused_changes_nothing(bench):
     # Four rods fix a pose that somebody may want to have, but no scale.
-    assert bench.set(max_log10_false_alarms=0.0, max_position_std_mm=1000.0, max_rotation_deg=30.0) == ""
+    open_limits = {"max_log10_false_alarms": 0.0, "max_position_std_mm": 1000.0, "max_target_error_mm": 1000.0}
+    assert bench.set(**open_limits, max_rotation_deg=30.0) == ""
     hu, _ = rendered(13, hidden=CUBE.line_names[:2])
     status = bench.status(bench.send(image_of(hu)))
     assert values_of(status)["inliers"] == "4", status.message
@@ -473,6 +489,47 @@ def test_spacing_from_outside_becomes_the_configured_one(bench):
     assert bench.call("reset_calibration").success
     (spacing,) = bench.client.get_parameters(bench.node, "pixel_spacing")
     assert list(spacing) == [0.501, 0.601]
+
+
+def test_frame_that_asks_for_an_orientation_is_refused_until_it_has_one(client, tmp_path):
+    path = tmp_path / "symmetric.yaml"
+    shipped = shipped_frames()["cube6"].read_text()
+    path.write_text(shipped.replace("lines:", "orientation_required: true\nlines:", 1))
+    hu, slice_from_frame = rendered(15)
+    spacing = f"pixel_spacing:=[{SCALE.sx},{SCALE.sy}]"
+    arguments = ["-r", "__ns:=/symmetric", "-p", f"frame_file:={path}", "-p", spacing]
+    with node_process("register_node", "--ros-args", *arguments):
+        bench = Bench(client, "/symmetric", "/symmetric/image")
+        bench.warm_up(bench.diagnostics)
+        bench.refuse(image_of(hu), "ambiguous", "orientation_required")
+        assert bench.set(nominal_orientation=[0.0, 0.0, 0.0, 1.0], max_rotation_deg=40.0) == ""
+        stamp = bench.send(image_of(hu))
+        assert_near(bench.pose(stamp), slice_from_frame)
+        assert bench.status(stamp).level == DiagnosticStatus.OK
+        # Now that poses are heard: there has been one only.
+        assert [message.header.stamp for message in bench.poses] == [stamp]
+
+
+def test_orientation_that_the_slice_contradicts_is_refused(client):
+    """Within a nominal orientation that is wrong by half a turn, six of eight rods match; anywhere, all do."""
+    cube8 = load_frame("cube8")
+    arguments = ["-r", "__ns:=/turned", "-p", "frame_file:=cube8", "-p", f"pixel_spacing:=[{SCALE.sx},{SCALE.sy}]"]
+    arguments += ["-p", "threshold:=2000.0"]
+    with node_process("register_node", "--ros-args", *arguments):
+        bench = Bench(client, "/turned", "/turned/image")
+        bench.warm_up(bench.diagnostics)
+        for seed in (16, 49, 325):
+            rng = np.random.default_rng(seed)
+            true = random_pose(rng, cube8, SCANNER, max_offset_mm=10.0)
+            image = image_of(render_slice([PlacedFrame(cube8, true)], SCANNER, rng).hu)
+            assert bench.set(nominal_orientation=[0.0, 0.0, 1.0, 0.0], max_rotation_deg=30.0) == ""
+            bench.refuse(image, "contradicted", "6 of 8 rods match within 30 degrees of nominal_orientation, but 8")
+            refused = image.header.stamp
+            assert bench.set(nominal_orientation=[0.0, 0.0, 0.0, 1.0], max_rotation_deg=40.0) == ""
+            stamp = bench.send(image)
+            assert_near(bench.pose(stamp), true)
+            assert bench.status(stamp).level == DiagnosticStatus.OK
+            assert of_stamp(bench.poses, refused) is None
 
 
 def test_without_frame_and_spacing_the_node_waits_for_them(client, tmp_path):

@@ -18,6 +18,7 @@ from test_register_node import (
     CUBE,
     SCALE,
     SCANNER,
+    START,
     Bench,
     assert_near,
     image_of,
@@ -166,7 +167,7 @@ def test_target_error_and_age(streams):
 def test_target_on_a_pose_that_will_not_do(streams, settings, reason):
     hu, _ = rendered(23)
     streams.accept(image_of(hu))
-    restored = {"max_pose_age": 60.0, "max_target_error_mm": 1000.0}
+    restored = {name: START[name] for name in settings}
     if reason == "pose_too_old":
         end = time.monotonic() + 0.2
         streams.client.wait_for(lambda: time.monotonic() > end, "the pose to age")

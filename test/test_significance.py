@@ -20,7 +20,6 @@ from stereoreg_ros.matching.prior import Near, Prior
 from stereoreg_ros.matching.significance import (
     Chance,
     area_of_uniform_mm2,
-    clutter_area_mm2,
     log10_expected,
     lucky_chi_square,
     share_of,
@@ -148,48 +147,6 @@ class TestPoseVolume:
         frame = load_frame("zframe")
         assert plane_sample(frame, 5) is plane_sample(frame, 5)
         np.testing.assert_allclose(np.linalg.norm(plane_sample(frame, 5).normals, axis=1), 1)
-
-
-class TestClutterArea:
-    def test_uniform_clutter_has_its_own_area(self) -> None:
-        rng = np.random.default_rng(7)
-        spots = rng.uniform(0, 200, (4000, 2))
-        # As the matched spots of a frame: some of those there, not all.
-        matched = np.flatnonzero(np.linalg.norm(spots - 100, axis=1) < 40)[::50]
-        assert clutter_area_mm2(spots, matched, None) == pytest.approx(200**2, rel=0.1)
-        assert clutter_area_mm2(spots, matched, 200.0**2) == pytest.approx(200**2, rel=0.1)
-
-    def test_box_around_few_spots_is_made_up_for(self) -> None:
-        rng = np.random.default_rng(10)
-        areas = [clutter_area_mm2(spots, np.arange(4), None) for spots in rng.uniform(0, 100, (4000, 12, 2))]
-        # Where clutter happens to be dense around the four it is less; that is rare.
-        assert 0.9 * 100**2 < np.mean(areas) < 1.05 * 100**2
-
-    def test_by_hand(self) -> None:
-        # Four at 10 mm around (50, 50), six unmatched among them, five far off: radius 15 mm, six unmatched there where
-        # 11 * 707 / 10000 = 0.8 are expected.
-        among = [[52, 51], [48, 49], [51, 47], [53, 53], [47, 52], [49, 54]]
-        spots = np.array([[40, 50], [60, 50], [50, 40], [50, 60], *among, *[[200 + i, 0] for i in range(5)]], float)
-        assert clutter_area_mm2(spots, np.arange(4), 1e4) == pytest.approx(15 * math.pi * 15**2 / 6)
-        # One or two there are nothing unusual.
-        assert clutter_area_mm2(np.delete(spots, range(5, 10), axis=0), np.arange(4), 1e4) == 1e4
-
-    def test_never_more_than_the_slice(self) -> None:
-        spots = np.random.default_rng(11).uniform(0, 100, (8, 2))
-        assert clutter_area_mm2(spots, np.arange(4), 3000.0) <= 3000.0
-
-    def test_denser_clutter_nearby_shrinks_it(self) -> None:
-        rng = np.random.default_rng(8)
-        matched = np.array([[40, 50], [60, 50], [50, 40], [50, 60]], dtype=float)
-        near, far = rng.uniform(42, 58, (20, 2)), rng.uniform(300, 400, (20, 2))
-        crowded = clutter_area_mm2(np.concatenate([matched, near]), np.arange(4), 1e5)
-        sparse = clutter_area_mm2(np.concatenate([matched, far]), np.arange(4), 1e5)
-        assert crowded < 0.3 * sparse
-
-    def test_does_not_depend_on_place_or_order(self) -> None:
-        spots = np.random.default_rng(9).uniform(0, 200, (30, 2))
-        area = clutter_area_mm2(spots, np.array([3, 8, 11, 20]), None)
-        assert clutter_area_mm2(spots - 500, np.array([20, 3, 8, 11]), None) == pytest.approx(area)
 
 
 def test_area_of_uniform_spots_is_the_slices_where_known() -> None:

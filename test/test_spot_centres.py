@@ -122,7 +122,8 @@ class TestAuto:
         assert len(found) == 1
         np.testing.assert_allclose(found.centres_px[0], [79.5, 70.0], atol=0.1)
 
-    def test_what_is_far_fainter_than_the_rest_is_left_out(self) -> None:
+    @pytest.mark.parametrize(("faint", "kept"), [(90.0, True), (35.0, False)])
+    def test_what_is_far_fainter_than_the_rest_must_be_sure(self, faint: float, kept: bool) -> None:
         v, u = np.indices((120, 150))
         image = np.random.default_rng(8).normal(0, 5.0, u.shape)
         for x, y, height in (
@@ -131,10 +132,10 @@ class TestAuto:
             (30, 80, 800),
             (70, 80, 1000),
             (110, 60, 400),
-            (110, 90, 90),
+            (110, 90, faint),
         ):
-            image += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 3.0)
-        assert len(found_in(image, RegistrationOptions(threshold="auto"))) == 5
+            image += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 6.0)
+        assert len(found_in(image, RegistrationOptions(threshold="auto"))) == (6 if kept else 5)
 
     @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (3, 3), (8, 8), (60, 80)])
     def test_none_in_an_empty_image(self, shape: tuple[int, int]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.spots import find_spots
 
 SCALE = PixelScale(0.5, 0.5)
-OPTIONS = RegistrationOptions()
+OPTIONS = RegistrationOptions(threshold=2000.0)
 
 
 def drawn(centres: Array, shape: tuple[int, int] = (60, 80), peak: float = 20_000.0, sigma: float = 1.0) -> Array:
@@ -79,7 +81,7 @@ class TestWhatIsASpot:
         scale = PixelScale(0.5, 0.4)
 
         def found(low: float, high: float) -> list[list[float]]:
-            options = RegistrationOptions(min_spot_area_mm2=low, max_spot_area_mm2=high)
+            options = replace(OPTIONS, min_spot_area_mm2=low, max_spot_area_mm2=high)
             rounded: list[list[float]] = np.round(spots_of(image, options, scale), 6).tolist()
             return rounded
 

@@ -315,7 +315,7 @@ def plain_estimate(
         cuts = cut(frame, pose.rotation, pose.translation)
         jacobian = cut_jacobian(cuts, pose.translation)[lines].reshape(-1, 6)
         residual = (spots_mm - cuts.points_mm[lines]).ravel()
-        covariance = np.linalg.inv(jacobian.T @ (weights[:, None] * jacobian))
+        covariance = np.asarray(np.linalg.inv(jacobian.T @ (weights[:, None] * jacobian)), dtype=np.float64)
         step = covariance @ jacobian.T @ (weights * residual)
         pose = pose.perturbed(step[:3], step[3:])
     return pose, covariance, float(weights @ residual**2)
@@ -342,7 +342,7 @@ def test_of_a_perfect_frame_all_is_as_least_squares_alone_has_it(missing: int) -
         size = np.sqrt(np.diag(covariance))
         apart = pose_error(result.scanner_from_frame, found)
         assert np.abs(apart / size).max() < 1e-4
-        at_result: Array = np.linalg.inv(information(frame, lines, result.scanner_from_frame, variances))
+        at_result = np.linalg.inv(information(frame, lines, result.scanner_from_frame, variances))
         np.testing.assert_allclose(
             result.covariance / np.outer(size, size), at_result / np.outer(size, size), atol=1e-9
         )

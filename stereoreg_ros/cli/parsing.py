@@ -63,7 +63,7 @@ def add_options(
         shown = " ".join(f"{value:g}" for value in default) if several else default
         group.add_argument(
             f"--{entry.name.replace('_', '-')}",
-            metavar="NAME" if kind is str else "N",
+            metavar=f"N|{word}" if word is not None else "NAME" if kind is str else "N",
             nargs=len(default) if several else None,
             type=kind if word is None else _number_or(word),
             default=default,

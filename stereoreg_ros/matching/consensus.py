@@ -233,16 +233,26 @@ def log10_false_alarms(
     matched = hypothesis.spot_of_line[lines]
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
     covariances = spots.match_covariances(frame, cuts, hypothesis.spot_of_line)[lines]
-    jacobian = (whitening_of(covariances) @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
+    whitening = whitening_of(covariances)
+    jacobian = (whitening @ cut_jacobian(cuts, hypothesis.translation)[lines]).reshape(-1, 6)
+    # Errors that spots share enlarge the ball around the spots of a pose, and stretch the surface of the poses less.
+    used = hypothesis.spot_of_line != UNMATCHED
+    shared = spots.tolerances.common(frame, cuts, spots.mm[hypothesis.spot_of_line], used)[lines]
+    moved = (whitening @ shared).reshape(len(jacobian), -1)
+    inner = np.eye(moved.shape[1]) + moved.T @ moved
+    crossed = moved.T @ jacobian
+    information = jacobian.T @ jacobian - crossed.T @ np.linalg.solve(inner, crossed)
+    enlarged = 0.5 * float(np.linalg.slogdet(inner)[1]) / math.log(10)
     variance_mm2 = _typical(np.sqrt(np.linalg.det(covariances)))
-    ratio = float(stretch(jacobian.T @ jacobian, variance_mm2))
+    ratio = float(stretch(information, variance_mm2))
     area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
     # Clutter that is denser where the matched spots lie is as if all were spread over less.
     density = math.exp(float(np.log(matched_densities(spots.mm, matched, area_mm2, in_order)).mean()))
     dense_mm2 = len(spots.mm) / density
     volume = pose_volume(frame, len(lines), prior, min(area_mm2, dense_mm2))
     chance = Chance(len(spots.mm), dense_mm2, variance_mm2, ratio * volume)
-    return log10_expected(len(lines), hypothesis.chi_square, chance) - math.log10(share_of(len(lines), len(frame)))
+    expected = log10_expected(len(lines), hypothesis.chi_square, chance) + enlarged
+    return expected - math.log10(share_of(len(lines), len(frame)))
 
 
 def least_log10_false_alarms(inliers: int, spots: Spots, frame: Frame, prior: Prior) -> float:

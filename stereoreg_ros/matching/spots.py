@@ -21,6 +21,8 @@ _LONG_MM, _LEAST_ALIGNED = 3.0, 0.8
 # Of a solid rod cut at an angle, the spot is an ellipse: its squared length, as `Streaks` has it, is that share of
 # (diameter * slope) squared. A tube that is bright in its wall only is longer by the square root of two.
 _OF_DIAMETER, _HOLLOW = 0.75, 2.0
+# Length, as a share of the diameter, of a thick rod's spot that is not round, its axes a fifth apart.
+_UNEVEN = 0.55
 
 
 class Streaks(NamedTuple):
@@ -48,7 +50,8 @@ class Streaks(NamedTuple):
             least = np.where(whole, self.thickness_mm * steepness, 0.0)[..., None]
             most = steepness * np.hypot(self.thickness_mm, math.sqrt(_HOLLOW * _OF_DIAMETER) * frame.diameters)
             length = np.linalg.norm(self.along_mm, axis=-1)
-            allowed = length <= (1 + _LENGTH_SHARE) * most[..., None] + _LENGTH_SLACK_MM
+            slack_mm = np.hypot(_LENGTH_SLACK_MM, _UNEVEN * frame.diameters)[:, None]
+            allowed = length <= (1 + _LENGTH_SHARE) * most[..., None] + slack_mm
             allowed &= self.cut_short | (length >= (1 - _LENGTH_SHARE) * least - _LENGTH_SLACK_MM)
             aligned = np.abs(slope @ self.along_mm.T) >= _LEAST_ALIGNED * steepness[..., None] * length
         return np.asarray(allowed & (aligned | (np.minimum(most[..., None], length) < _LONG_MM)))

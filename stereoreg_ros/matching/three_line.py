@@ -33,6 +33,7 @@ from stereoreg_ros.matching.pose_volume import plane_sample, typical_slices
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, Starts, search_seeds
 from stereoreg_ros.matching.settling import settle
+from stereoreg_ros.matching.significance import share_of
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.matching.triple_order import further_triples, triple_order
@@ -123,18 +124,21 @@ def find_better(
     """An explanation within the prior that scores above `least_score`, and that chance brings less often than allowed.
 
     The one of the most rods, or None where there is none of `fewest` or more. least_score: see `consensus.score`;
-    allowed_log10: see `consensus.log10_false_alarms`. Raises SearchGivenUpError where that would take too long to say.
+    allowed_log10: number of such explanations that chance may bring, each number of rods taken by itself. Raises
+    SearchGivenUpError where that would take too long to say.
     """
     gains = spots.gains(frame)
-    search = _Search(spots, frame, prior, replace(options, max_log10_false_alarms=allowed_log10))
+    search = _Search(spots, frame, prior, options)
     for level in search.levels:
         most_chi_square = 2 * (level * gains.max() - least_score)
-        if level < fewest or most_chi_square < 0 or search.hopeless(level):
+        # What matches of so many rods have to share with those of other numbers does not count here.
+        allowed = allowed_log10 - math.log10(share_of(level, len(frame)))
+        if level < fewest or most_chi_square < 0 or search.least_false_alarms(level) > allowed:
             break
         better = [
             one
             for one in distinct([*search.level(level, most_chi_square, [])], gains)
-            if score(one, gains) > least_score and search.is_acceptable(one)
+            if score(one, gains) > least_score and search.false_alarms(one) <= allowed
         ]
         if better:
             return better[0]
@@ -178,9 +182,10 @@ class _Search:
 
     def is_acceptable(self, hypothesis: Hypothesis) -> bool:
         """Whether chance is ruled out as an explanation of the explanation."""
-        return self._false_alarms(hypothesis) <= self._options.max_log10_false_alarms
+        return self.false_alarms(hypothesis) <= self._options.max_log10_false_alarms
 
-    def _false_alarms(self, hypothesis: Hypothesis) -> float:
+    def false_alarms(self, hypothesis: Hypothesis) -> float:
+        """log10 of the number of false alarms, order in the clutter apart; see `consensus.log10_false_alarms`."""
         if hypothesis not in self._log10_false_alarms:
             value = log10_false_alarms(hypothesis, self._spots, self._frame, self._prior, in_order=False)
             self._log10_false_alarms[hypothesis] = value
@@ -188,13 +193,15 @@ class _Search:
 
     def hopeless(self, level: int) -> bool:
         """Whether even a true match of so many rods would hardly be told from chance."""
-        least = least_log10_false_alarms(level, self._spots, self._frame, self._prior)
-        return least > self._options.max_log10_false_alarms
+        return self.least_false_alarms(level) > self._options.max_log10_false_alarms
+
+    def least_false_alarms(self, level: int) -> float:
+        """log10 of the number of false alarms that a true match of so many rods is hardly ever below."""
+        return least_log10_false_alarms(level, self._spots, self._frame, self._prior)
 
     def is_told_apart(self, level: int, best: Hypothesis, apart: float) -> bool:
         """Whether chance brings matches of so many rods so much more often that they are no rivals of the best."""
-        least = least_log10_false_alarms(level, self._spots, self._frame, self._prior)
-        return least > self._false_alarms(best) + apart
+        return self.least_false_alarms(level) > self.false_alarms(best) + apart
 
     def has_rivals(self, level: int, chi_square: float) -> bool:
         """Whether chance may bring explanations of `level` rods, of so low a chi-square, that could be accepted."""

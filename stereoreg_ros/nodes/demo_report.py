@@ -153,7 +153,8 @@ def main() -> int:
 
 
 def _demonstrate(listener: _Listener, count: int, seed: int, output: Path) -> int:
-    registration = {"frame_file": "cube6"}
+    # As on a robot: how the frame roughly stands is known, and leaves room for the simulated tilt.
+    registration = {"frame_file": "cube6", "nominal_orientation": "[0.0, 0.0, 0.0, 1.0]", "max_rotation_deg": "30.0"}
     scanner = {
         "frame_file": "cube6",
         "slices": str(count),

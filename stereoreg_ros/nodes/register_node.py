@@ -419,7 +419,16 @@ class RegisterNode(Node):
 
 
 # What the matcher's tables depend on.
-_OF_THE_TABLES = {"pixel_spacing", "spot_noise_px", "matcher", "nominal_orientation", "max_rotation_deg", "min_inliers"}
+_OF_THE_TABLES = {
+    "pixel_spacing",
+    "spot_noise_px",
+    "frame_tolerance_mm",
+    "scale_tolerance",
+    "matcher",
+    "nominal_orientation",
+    "max_rotation_deg",
+    "min_inliers",
+}
 _NO_TF2 = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
 
 

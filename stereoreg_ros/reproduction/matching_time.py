@@ -15,10 +15,10 @@ from tqdm import tqdm
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.matching import maurin2009
-from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.registration import register_spots
 from stereoreg_ros.reproduction import paper
 from stereoreg_ros.reproduction.effort import Effort
+from stereoreg_ros.reproduction.exact_rods import exact_options
 from stereoreg_ros.reproduction.rods import FIRST_CUBE
 from stereoreg_ros.reproduction.table import Cell, Comparison, Section, Table
 from stereoreg_ros.simulation import ScannerSettings, SpotSet, SpotSetSettings, random_spot_set
@@ -98,7 +98,7 @@ def _cell(name: str, false_spots: int, answers: Sequence[Answer], extrapolated: 
 
 
 def _ours(problem: SpotSet, settings: SpotSetSettings) -> Answer:
-    options = RegistrationOptions(spot_noise_px=settings.noise_std_px)
+    options = exact_options(settings.noise_std_px)
     start = time.perf_counter()
     result = register_spots(problem.spots_px, FIRST_CUBE, SCANNER.scale, options)
     seconds = time.perf_counter() - start

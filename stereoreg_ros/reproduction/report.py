@@ -48,7 +48,9 @@ _DIFFERENCES = """## What differs from the paper
   rods' own measurement and no errors of the scanner's geometry or of the table's motion. Of what the paper's table 1
   and fig. 10 contain, only noise and sampling are here: our figures there say what the method and the spot finding can
   do, not what a scanner will give.
-- Spots are found by `find_spots` above 2000 HU and centred by their symmetry, not by a plain centroid."""
+- Spots are found by `find_spots` above 2000 HU and centred by their symmetry, not by a plain centroid.
+- The simulated rods and pixel spacing are exactly as stated, and registration is run with `frame_tolerance_mm` and
+  `scale_tolerance` of 0. The package's defaults allow for frames and scanners that are not."""
 
 
 def report(sections: Sequence[Section], effort: Effort, seed: int, minutes: float) -> str:

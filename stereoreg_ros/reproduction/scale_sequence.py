@@ -10,11 +10,11 @@ from tqdm import tqdm
 
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.registration import register_slice
 from stereoreg_ros.reproduction import paper
 from stereoreg_ros.reproduction.calibration_accuracy import METHODS
 from stereoreg_ros.reproduction.effort import Effort
+from stereoreg_ros.reproduction.exact_rods import exact_options
 from stereoreg_ros.reproduction.rods import FIRST_CUBE
 from stereoreg_ros.reproduction.table import Cell, Comparison, Section, Table
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, render_slice
@@ -24,7 +24,7 @@ from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 SETTINGS: Final = ScannerSettings(scale=PixelScale(0.475, 0.475), slice_thickness_mm=0.5)
 TILT: Final = (0.09, -0.12, 0.05)
 TRAVEL_MM: Final = 42.0
-OPTIONS: Final = RegistrationOptions(spot_noise_px=0.1)
+OPTIONS: Final = exact_options(spot_noise_px=0.1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,10 @@ from tqdm import tqdm
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.registration import register_frames
 from stereoreg_ros.reproduction import paper
 from stereoreg_ros.reproduction.effort import Effort
+from stereoreg_ros.reproduction.exact_rods import exact_options
 from stereoreg_ros.reproduction.rods import FIRST_CUBE, SECOND_CUBE, shrunk
 from stereoreg_ros.reproduction.table import Cell, Comparison, Section, Table
 from stereoreg_ros.result import Refusal, Registration
@@ -26,7 +26,7 @@ from stereoreg_ros.solvers.methods import POSE_METHODS
 
 # As in the paper: 512 x 512 pixels of about 0.475 mm, slices of 0.5 mm; no patient, the cubes lie on a rail.
 SETTINGS: Final = ScannerSettings(scale=PixelScale(0.475, 0.475), slice_thickness_mm=0.5, body=False)
-OPTIONS: Final = RegistrationOptions(spot_noise_px=0.1)
+OPTIONS: Final = exact_options(spot_noise_px=0.1)
 # The rail is not quite square to the scanner.
 RAIL_ROTATION: Final = (0.04, -0.06, 0.03)
 SECOND_IN_FIRST: Final = Pose(np.eye(3), np.array(paper.RAIL_OFFSET_MM))

@@ -28,7 +28,7 @@ _MOST_PEAKS, _MOST_PIXELS, _LEAST_PEAKS = 512, 2_000_000, 32
 # So many pixels of squares are looked at together.
 _AT_ONCE: Final = 1_000_000
 # What a square cuts off is looked at in one so many radii to each side.
-_LONGER: Final = 2
+_LONGER: Final = 1.5
 # What stands out by less than this share of its rough height, and is larger than this share of the largest spot, is the
 # top of something larger.
 _TOP, _LARGE = 1 / 3, 1 / 4
@@ -98,7 +98,9 @@ def _candidates(
         part = np.s_[start : start + at_once]
         height, noise, cut[part] = prominences(smooth, peaks.take(part), reach, most)
         rows = np.flatnonzero(height)
-        found += _regions(wide, smooth.margin, peaks.take(part).take(rows), reach, height[rows], noise[rows], fewest, most)
+        found += _regions(
+            wide, smooth.margin, peaks.take(part).take(rows), reach, height[rows], noise[rows], fewest, most
+        )
     return found, cut
 
 

@@ -7,13 +7,15 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 # A peak is the highest of so many pixels to a side.
 _SIDE: Final = 5
 # What varies by less is flat, HU.
 _FLAT_HU: Final = 1.0
 # In how many directions, of half a turn, its surroundings are sampled: few first, as most peaks are noise.
-_FEW_AXES, _AXES = 4, 16
+_FEW_AXES, _AXES = 2, 16
 # How many straight paths from a peak are followed: first some, and not far, pixel.
 _FEW_PATHS, _SHORT, _PATHS = 8, 8, 16
 # So many times the peaks that are wanted are followed along paths.
@@ -75,20 +77,21 @@ def _one_of_each_plateau(
     picture: NDArray[np.float32], at: NDArray[np.intp], height: NDArray[np.float32]
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
     """Of peaks that touch, as where the range of the image ends, the highest; moved to the middle of them where the
-    picture is as bright there.
+    picture is as bright there. The peaks are in the order of their numbers.
     """
     columns = picture.shape[1]
-    marked = np.zeros(picture.shape, np.uint8)
-    marked.ravel()[at] = 1
-    if not any(marked.ravel().take(at + step).any() for step in (1, columns - 1, columns, columns + 1)):
+    beside = at + np.array([[1], [columns - 1], [columns], [columns + 1]])
+    row = np.minimum(np.searchsorted(at, beside), len(at) - 1) if len(at) else beside
+    _, one = np.nonzero(at[row] == beside)
+    if not one.size:
         return at, height
-    _, labels = cv2.connectedComponents(marked, connectivity=8)
-    label = np.asarray(labels).ravel().take(at)
+    touching = coo_array((np.ones(len(one)), (one, row[at[row] == beside])), shape=(len(at), len(at)))
+    _, label = connected_components(touching, directed=False)
     v, u = np.divmod(at, columns)
-    count = np.maximum(np.bincount(label), 1)
+    count = np.bincount(label)
     middle_v, middle_u = (np.rint(np.bincount(label, place) / count).astype(np.intp) for place in (v, u))
     rows = np.lexsort((-height, label))
-    rows = rows[np.diff(label[rows], prepend=0) > 0]
+    rows = rows[np.diff(label[rows], prepend=-1) > 0]
     middle = (middle_v * columns + middle_u)[label[rows]]
     flat = picture.ravel()
     return np.where(flat.take(middle) == flat.take(at[rows]), middle, at[rows]), height[rows]

@@ -96,11 +96,11 @@ def prominences(smooth: SmoothSlice, peaks: Peaks, reach: int, most: float) -> P
 
 
 def centred(smooth: SmoothSlice, peaks: Peaks, reach: int) -> Peaks:
-    """The peaks, each moved to the middle of what is as bright within reach: along a long streak any place may be the
-    brightest.
+    """The peaks, each moved to the middle of what is at least half as high around it: along a long streak any place
+    may be the brightest.
     """
     squares = _squares(smooth, peaks, reach)
-    own = around_middle(squares.hu >= (peaks.top - np.float32(least_height(smooth.noise)))[:, None, None])
+    own = around_middle(squares.hu >= (peaks.top - 0.5 * peaks.rough_height)[:, None, None])
     place, area = np.arange(2 * reach + 1), own.sum(axis=(1, 2))
     middle_u, middle_v = (own.sum(axis=axis) @ place / area for axis in (1, 2))
     off_u, off_v = place - middle_u[:, None], place - middle_v[:, None]

@@ -59,10 +59,11 @@ def centres_of_symmetry(
     inverse = _inverse(_regular(compared.information))
     height = np.abs(patches).max(axis=(1, 2))
     variance = _variance(compared)
-    covariances = _moderated(variance, noise_hu2, height)[:, None, None] * (inverse @ _by_noise(compared) @ inverse)
     # Where more than noise disturbs the symmetry, as the end of a rod within the slice or a bubble in a tube, there is
     # no centre of symmetry: the centroid is taken, and what the two differ by is an error.
     lame = (variance > _MOST_NOISE * noise_hu2) & (variance > (_MOST_ODD * height) ** 2)
+    moderated = _moderated(variance, noise_hu2, height, lame)
+    covariances = moderated[:, None, None] * (inverse @ _by_noise(compared) @ inverse)
     differs = np.where(lame[:, None], centres - rough, 0.0)
     covariances += differs[:, :, None] * differs[:, None, :]
     centres = np.where(lame[:, None], rough, centres)
@@ -71,15 +72,19 @@ def centres_of_symmetry(
     return centres, 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
 
 
-def _moderated(variance: Array, noise_hu2: Array, height: Array) -> Array:
-    """Variances (n,) HU^2 of what spots differ by from their mirror images, taken together.
+def _moderated(variance: Array, noise_hu2: Array, height: Array, lame: NDArray[np.bool_]) -> Array:
+    """Variances (n,) HU^2 of what spots differ by from their mirror images, taken together; lame: those (n,) without a
+    centre of symmetry, which say nothing of the others where there are others.
 
     Each by itself comes from a few dozen pixels. What is more than the noise comes of the pixels' size and grows with
     the spot's height; for spots alike it is the same but for where between the pixels their centres lie. A spot that
     differs by much more than the others has its own reason to, and keeps its own variance.
     """
-    noise = np.median(noise_hu2)
-    usual = noise + np.median(np.maximum(variance - noise, 0.0) / np.maximum(height, 1.0) ** 2) * height**2
+    fit = lame if lame.all() else ~lame
+    # Beside an edge the surroundings vary by more than noise: that is no other spot's.
+    noise = np.minimum(noise_hu2, np.median(noise_hu2[fit]))
+    odd = np.median((np.maximum(variance - noise, 0.0) / np.maximum(height, 1.0) ** 2)[fit])
+    usual = noise + odd * height**2
     return np.asarray(np.where(variance < _MUCH_MORE * usual, usual, variance), dtype=np.float64)
 
 
