@@ -269,10 +269,10 @@ def plausibility(scene: Scene, result: Registration) -> float | None:
     """Probability of residuals as large by noise and tolerance alone; None unless each rod that shows has its own spot.
 
     Worked out here, not taken from the result, as it excuses a wrong pose. The scale's tolerance is left out: that
-    excuses less.
+    excuses less. None too where a rod has several spots: those that are left over speak against a pose.
     """
-    shown = set(scene.rods[scene.rods != NO_ROD].tolist())
-    own = {match.line_index for match in result.matches if scene.rods[match.spot] == match.line_index}
+    shown = sorted(scene.rods[scene.rods != NO_ROD].tolist())
+    own = sorted(match.line_index for match in result.matches if scene.rods[match.spot] == match.line_index)
     if not shown or own != shown or len(result.matches) != len(own):
         return None
     options, frame = options_of(scene), scene.frame

@@ -33,8 +33,8 @@ class RegistrationOptions:
     """
 
     threshold: float | str = _option(
-        2000.0,
-        "HU above which a pixel may belong to a rod's spot; 'auto': spots are told by contrast to their surroundings",
+        AUTO,
+        "HU above which a pixel may belong to a rod's spot, 2000 in the paper; 'auto': what stands out from around it",
         -32768.0,
         65535.0,
         AUTO,

@@ -37,7 +37,8 @@ def holes(pitch_mm: float, degrees: float, side: int) -> Array:
     """A square lattice (side^2, 2) mm about the middle of the slice."""
     steps = (np.arange(side) - (side - 1) / 2) * pitch_mm
     points: Array = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) @ turned(degrees).T
-    return np.asarray(points + [[SIDE_MM / 2 + 1.3, SIDE_MM / 2 - 0.7]], dtype=np.float64)
+    points += np.array([SIDE_MM / 2 + 1.3, SIDE_MM / 2 - 0.7])
+    return points
 
 
 class TestUniform:
@@ -163,9 +164,12 @@ class TestLattices:
             assert np.mean(found > 5) > 0.8
 
     def test_matched_spots_elsewhere_are_not_of_it(self) -> None:
-        """Those of a true frame over a template: one in 17 lies on a hole by chance, as large as holes are taken to be."""
+        """Of a true frame over a template one spot in 17 lies on a hole by chance, as large as holes are taken to be.
+
+        The same holes are on finer lattices, too, at 1.41, 2, 2.24 and 3 to the pitch, of which the fitted one may be any.
+        """
         rng = np.random.default_rng(9)
-        lattice = holes(7.0, 5.0, 13)
+        lattice = holes(13.0, 5.0, 13)
         on_holes = 0
         sets = 40
         for _ in range(sets):
@@ -174,8 +178,7 @@ class TestLattices:
             on_holes += int((ratios(chosen, own) > 1.5 * ratios(chosen, own, in_order=False)).sum())
         share = 0.24**2
         print(f"{on_holes} of {6 * sets} raised")
-        # That the lattice is fitted to them too adds a little.
-        assert on_holes <= 1.5 * share * 6 * sets + 4 * math.sqrt(share * 6 * sets)
+        assert on_holes <= 4 * share * 6 * sets
 
     @pytest.mark.parametrize("seed", [1, 2])
     def test_among_uniform_ones(self, seed: int) -> None:

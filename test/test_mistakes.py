@@ -138,6 +138,12 @@ class TestJudge:
         swapped = scene.rods.copy()
         swapped[shown[:2]] = swapped[shown[1::-1]]
         assert plausibility(replace(scene, rods=swapped), result) is None
+        broken = replace(
+            scene,
+            spots_px=np.vstack([scene.spots_px, scene.spots_px[shown[0]] + [4.0, 0.0]]),
+            rods=np.append(scene.rods, scene.rods[shown[0]]),
+        )
+        assert plausibility(broken, result) is None
 
 
 class TestRow:
