@@ -20,14 +20,17 @@ _MIB: Final = 2**20
 
 
 class RegisterProcess:
-    """register_node, told the scale of the slices; `ready_s`: from its start until it said that it was ready."""
+    """register_node, configured with the scale of the slices and with how the frame roughly stands.
+
+    ready_s: from its start until it said that it was ready.
+    """
 
     def __init__(self, log: IO[bytes]) -> None:
         scale = SCANNER.scale
         self._log = log
         begun = time.monotonic()
         command = [sys.executable, "-m", "stereoreg_ros.nodes.register_node"]
-        command += ["--ros-args", "-p", f"pixel_spacing:=[{scale.sx}, {scale.sy}]"]
+        command += ["--ros-args", "-p", f"pixel_spacing:=[{scale.sx}, {scale.sy}]", "-p", "max_rotation_deg:=30.0"]
         self._popen = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         while _READY not in self.output:
             if not self.running or time.monotonic() > begun + DEADLINE_S:

@@ -36,6 +36,8 @@ def _attempt(data: bytes) -> None:
     else:
         assert again.name == frame.name
         assert again.line_names == frame.line_names
+        assert np.array_equal(again.tolerances_or(-1.0), frame.tolerances_or(-1.0))
+        assert again.orientation_required == frame.orientation_required
 
 
 def _seeds() -> list[bytes]:
@@ -46,7 +48,13 @@ def _seeds() -> list[bytes]:
         b'    from: &from [1e1, -2.5, +3]\n    to: [1, 2, 3]\n    diameter: 0.5\n  - name: "c d"\n'
         b"    from: *from\n    to: [1, -2, 3]\n    diameter: 2\n"
     )
-    return [block, shipped]
+    tolerant = (
+        b"name: tolerant\ntolerance_mm: 0.2\norientation_required: true\nlines:\n"
+        b"  - {name: a, from: [0, 0, 0], to: [0, 0, 90], diameter: 1}\n"
+        b"  - {name: b, from: [40, 0, 0], to: [60, 0, 90], diameter: 1, tolerance_mm: 1e-1}\n"
+        b"  - {name: c, from: [0, 40, 0], to: [0, 60, 90], diameter: 1, tolerance_mm: 0}\n"
+    )
+    return [block, tolerant, shipped]
 
 
 FRAME = Kind(

@@ -30,8 +30,8 @@ _LARGEST_REGISTERED: Final = 96 * 96
 # What the node's parameters may be; the message's stamp chooses, so that the message is all there is to an input.
 _RESCALES: Final = ((1.0, 0.0), (1.0, -1024.0), (-1.0, 0.0), (1e6, 1e6), (1e-6, -1e6))
 _OPTIONS: Final = (
-    RegistrationOptions(),
-    RegistrationOptions(threshold=AUTO),
+    RegistrationOptions(threshold=2000.0, frame_tolerance_mm=0.0, scale_tolerance=0.0),
+    RegistrationOptions(threshold=AUTO, max_rotation_deg=30.0),
     RegistrationOptions(threshold=-32768.0, max_spot_area_mm2=10000.0),
     RegistrationOptions(slice_thickness_mm=5.0),
 )

@@ -166,7 +166,7 @@ class TestLattices:
     def test_matched_spots_elsewhere_are_not_of_it(self) -> None:
         """Of a true frame over a template one spot in 17 lies on a hole by chance, as large as holes are taken to be.
 
-        The same holes are on finer lattices, too, at 1.41, 2, 2.24 and 3 to the pitch, of which the fitted one may be any.
+        The same holes are on finer lattices, too, 1.41, 2, 2.24 and 3 to the pitch, and any may be the fitted one.
         """
         rng = np.random.default_rng(9)
         lattice = holes(13.0, 5.0, 13)

@@ -23,7 +23,7 @@ from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
-from ros_process import REPOSITORY, ROS_ENVIRONMENT, NodeProcess, RosClient, node_process
+from ros_process import DEADLINE_S, REPOSITORY, ROS_ENVIRONMENT, NodeProcess, RosClient, node_process
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
@@ -91,9 +91,10 @@ class Bench:
         self.client.publish(self.image_topic, image)
         return image.header.stamp
 
-    def status(self, stamp: Time) -> DiagnosticStatus:
+    def status(self, stamp: Time, deadline_s: float = DEADLINE_S) -> DiagnosticStatus:
         """The one status of the image with this stamp."""
-        array = self.client.wait_for(lambda: of_stamp(self.diagnostics, stamp), "the diagnostics of an image")
+        what = "the diagnostics of an image"
+        array = self.client.wait_for(lambda: of_stamp(self.diagnostics, stamp), what, deadline_s)
         (status,) = array.status
         assert status.name == "register_node: registration"
         assert [pair.key for pair in status.values] == DIAGNOSTIC_KEYS

@@ -97,8 +97,8 @@ def test_two_frames_have_topics_and_statuses_of_their_own(client):
             ("cube6", "accepted", "6"),
             ("cube8", "accepted", "8"),
         ]
-        # One pass over the image; the second frame is offered what the first has left.
-        assert int(values[1]["spots"]) == int(values[0]["spots"]) - 6
+        # One pass over the image; where no spot is claimed twice, each frame is offered all of them.
+        assert [one["spots"] for one in values] == ["14", "14"]
 
 
 NAMES = tuple(f"register_node: registration of {name}" for name in ("cube6", "cube8"))
@@ -223,7 +223,8 @@ def test_slices_that_have_waited_too_long_are_skipped_for_the_newest_and_counted
             client.publish("/late/slice_pose", plane)
             bench.send(image_of(rendered(25)[0]), stamp=stamp)
         client.wait_for(done.done, "the change of the frame")
-        bench.status(late[-1])
+        # A search for twenty rods: ten seconds of a core that may have other things to do.
+        bench.status(late[-1], 90.0)
 
         def skipped() -> int:
             told = [values_of(one) for one in statuses(bench.diagnostics, "register_node: stream")]

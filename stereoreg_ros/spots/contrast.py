@@ -64,7 +64,8 @@ def regions_by_contrast(hu: NDArray[np.float32], fewest: float, most: float) -> 
     out of the noise around it.
     """
     radius = int(np.sqrt(most / np.pi)) + 4
-    reach, margin = radius + 3, int(_LONGER * radius)
+    reach = radius + 3
+    margin = max(reach, int(_LONGER * radius))
     wide = np.asarray(cv2.copyMakeBorder(hu, margin, margin, margin, margin, cv2.BORDER_REPLICATE), dtype=np.float32)
     smooth = smoothed(wide, margin)
     most_peaks = int(np.clip(_MOST_PIXELS // (2 * reach + 1) ** 2, _LEAST_PEAKS, _MOST_PEAKS))

@@ -97,10 +97,11 @@ def prominences(smooth: SmoothSlice, peaks: Peaks, reach: int, most: float) -> P
 
 def centred(smooth: SmoothSlice, peaks: Peaks, reach: int) -> Peaks:
     """The peaks, each moved to the middle of what is at least half as high around it: along a long streak any place
-    may be the brightest.
+    may be the brightest. None of them may be at the edge of the slice.
     """
     squares = _squares(smooth, peaks, reach)
     own = around_middle(squares.hu >= (peaks.top - 0.5 * peaks.rough_height)[:, None, None])
+    own &= ~at_the_edge(smooth.hu.shape, smooth.margin, peaks, reach)
     place, area = np.arange(2 * reach + 1), own.sum(axis=(1, 2))
     middle_u, middle_v = (own.sum(axis=axis) @ place / area for axis in (1, 2))
     off_u, off_v = place - middle_u[:, None], place - middle_v[:, None]
