@@ -5,9 +5,9 @@ with all that is known of it: add `--scene 17`. All kinds and frames at 2,000 sc
 
 right: accepted, within 2 mm and 3 degrees. weak: farther off, but no more than the covariance says. wrong: farther off
 than that (a squared Mahalanobis distance that chance exceeds once in 1e5), or accepted where the frame is absent. Of
-the wrong ones, `fits` are those in which every rod that shows has its own spot and residuals as large come by the
-stated noise and tolerance once in a hundred or more often: nothing in the slice speaks against such a pose. They are
-counted apart and do not fail.
+the wrong ones, `fits` are those that explain every spot that a rod made, with residuals as large as the stated noise
+and tolerance bring once in a hundred times or more often, while the true matches do not: nothing in the slice speaks
+against such a pose. They are counted apart and do not fail.
 
 What no single slice can show, whatever the software:
 - A mirrored image or a left-handed frame file: the mirror image of a scene is a scene. Not drawn here.
@@ -15,7 +15,8 @@ What no single slice can show, whatever the software:
 - A leaning rod mirrored in the file, near the height at which it crosses the true one: there both have the same spot,
   and farther off another tilt brings it nearly to its place. With plates of an N that reaches farthest: two of an N's
   three spots say where the plate is, and only the third at what height it is cut; read the wrong way round, it is
-  another height, which some other plane satisfies but for the foreshortening of the plates.
+  another height, which some other plane satisfies but for the foreshortening of the plates. `leksell_ct9` with the
+  front diagonal mirrored is exactly what the true one is upside down: without a prior every slice fits that.
 - Errors of spacing and of rods' ends leave 2 n - 6 figures to tell them by. Five rods leave four: some errors are then
   nearly those of another pose.
 The first two are kinds. Of the others it depends on the scene, which is what `fits` says.
@@ -39,6 +40,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from tqdm import tqdm
@@ -266,29 +269,48 @@ def judge(scene: Scene, result: Registration | Refusal, *, near_too: bool = Fals
 
 
 def plausibility(scene: Scene, result: Registration) -> float | None:
-    """Probability of residuals as large by noise and tolerance alone; None unless each rod that shows has its own spot.
+    """Probability of residuals as large by noise and tolerance alone; None where the slice speaks against the pose.
 
-    Worked out here, not taken from the result, as it excuses a wrong pose. The scale's tolerance is left out: that
-    excuses less. None too where a rod has several spots: those that are left over speak against a pose.
+    It does so unless every spot that a rod made is matched, and no other; a rod of several spots leaves some over.
+    Where the matches are not the true ones, those must not fit as well, or the slice is ambiguous. Worked out here, not
+    taken from the result, as it excuses a wrong pose. The scale's tolerance is left out: that excuses less.
     """
-    shown = sorted(scene.rods[scene.rods != NO_ROD].tolist())
-    own = sorted(match.line_index for match in result.matches if scene.rods[match.spot] == match.line_index)
-    if not shown or own != shown or len(result.matches) != len(own):
-        return None
-    options, frame = options_of(scene), scene.frame
+    made = np.flatnonzero(scene.rods != NO_ROD)
+    spots = np.array([match.spot for match in result.matches])
     rods = np.array([match.line_index for match in result.matches])
-    spots = scene.spots_px[[match.spot for match in result.matches]]
-    predicted, cuts = project(frame, result.estimate.slice_from_frame, scene.scale)
-    residuals = scene.scale.to_mm(spots - predicted[rods])
-    length = frame.lambda_max - frame.lambda_min
-    along = ((cuts.lambdas - frame.lambda_min) / length)[rods]
+    if not made.size or len(set(scene.rods[made])) < len(made) or not np.array_equal(np.sort(spots), made):
+        return None
+    if scene.truth is not None and not np.array_equal(scene.rods[spots], rods):
+        truth = scene.truth
+
+        def residuals(step: Array) -> Array:
+            return _whitened(scene, truth.perturbed(step[:3], step[3:]), scene.rods[made], made)
+
+        best = least_squares(residuals, np.zeros(6), x_scale=[1.0, 1.0, 1.0, 0.02, 0.02, 0.02])
+        if _probability(best.fun) > _FITS:
+            return None
+    return _probability(_whitened(scene, result.estimate.slice_from_frame, rods, spots))
+
+
+def _whitened(scene: Scene, pose: Pose, rods: NDArray[np.intp], spots: NDArray[np.intp]) -> Array:
+    """Residuals (2k,) of spots (k,) at rods (k,), in standard deviations, at a pose slice_from_frame."""
+    options, frame = options_of(scene), scene.frame
+    predicted, cuts = project(frame, pose, scene.scale)
+    residuals = scene.scale.to_mm(scene.spots_px[spots] - predicted[rods])
+    along = ((cuts.lambdas - frame.lambda_min) / (frame.lambda_max - frame.lambda_min))[rods]
     # Both ends are off, independently; what they are off by along the normal moves the cut along the rod's slope.
     slope = cuts.directions[rods, :2] / cuts.directions[rods, 2:]
     variance = frame.tolerances_or(options.frame_tolerance_mm)[rods] ** 2 * (along**2 + (1 - along) ** 2)
     of_rods = variance[:, None, None] * (np.eye(2) + slope[:, :, None] * slope[:, None, :])
     of_spots = options.spot_noise_px**2 * scene.scale.matrix @ scene.scale.matrix.T
-    chi_square = float(np.einsum("ni,nij,nj->", residuals, np.linalg.inv(of_rods + of_spots), residuals))
-    return float(chi2.sf(chi_square, 2 * len(rods) - 6))
+    whitening = np.linalg.inv(np.linalg.cholesky(of_rods + of_spots))
+    whitened: Array = (whitening @ residuals[..., None]).ravel()
+    return whitened
+
+
+def _probability(whitened: Array) -> float:
+    """Of residuals (2k,) as large, of which a pose has taken six."""
+    return float(chi2.sf(float(whitened @ whitened), len(whitened) - 6))
 
 
 def measure(kind: str, frame: str, start: int, count: int, seed: int = 0) -> list[Outcome]:

@@ -45,8 +45,8 @@ from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, in_sca
 _MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
 # An explanation that chance brings more often (log10) speaks against no other.
 _LOG10_RIVAL = -3.0
-# A second frame of the same kind is looked for with so many rods less than the first one shows.
-_FEWER_RODS = 2
+# A second frame of the same kind is looked for that shows as many rods as the first one, or one less.
+_FEWER_RODS = 1
 
 
 def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:

@@ -135,15 +135,34 @@ class TestJudge:
         assert one_far < 1e-6
         one_less = replace(result, estimate=replace(result.estimate, matches=result.matches[1:]))
         assert plausibility(scene, one_less) is None
-        swapped = scene.rods.copy()
-        swapped[shown[:2]] = swapped[shown[1::-1]]
-        assert plausibility(replace(scene, rods=swapped), result) is None
         broken = replace(
             scene,
             spots_px=np.vstack([scene.spots_px, scene.spots_px[shown[0]] + [4.0, 0.0]]),
             rods=np.append(scene.rods, scene.rods[shown[0]]),
         )
         assert plausibility(broken, result) is None
+
+    def test_other_matches_are_plausible_where_the_true_ones_do_not_fit(self) -> None:
+        scene, result = scene_of("true", "cube8", 0), accepted("true", "cube8", 0)
+        shown = np.flatnonzero(scene.rods != NO_ROD)
+        swapped = scene.rods.copy()
+        swapped[shown[:2]] = swapped[shown[1::-1]]
+        value = plausibility(replace(scene, rods=swapped), result)
+        assert value is not None
+        assert value > 1e-3
+
+    def test_a_twin_is_not_plausible_where_the_true_matches_fit_too(self) -> None:
+        scene, result = scene_of("true", "leksell_ct", 0), accepted("true", "leksell_ct", 0)
+        # Half a turn about x lays the two plates on themselves: front and back rods change places.
+        other = [2, 1, 0, 5, 4, 3]
+        half_turn = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, -120.0, -120.0]))
+        twin = replace(
+            result.estimate,
+            slice_from_frame=result.estimate.slice_from_frame @ half_turn,
+            matches=tuple(replace(match, line_index=other[match.line_index]) for match in result.matches),
+        )
+        assert (plausibility(scene, result) or 0.0) > 1e-3
+        assert plausibility(scene, replace(result, estimate=twin)) is None
 
 
 class TestRow:

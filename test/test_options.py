@@ -15,7 +15,7 @@ NUMBERS = [entry for entry in fields(RegistrationOptions) if entry.metadata["low
 
 def test_defaults_of_the_contract() -> None:
     options = RegistrationOptions()
-    assert options.threshold == 2000.0
+    assert options.threshold == "auto"
     assert options.max_log10_false_alarms == -6
     assert options.max_rotation_deg == 180.0
     assert options.nominal_orientation == (0.0, 0.0, 0.0, 1.0)
@@ -32,7 +32,7 @@ def test_every_option_is_described(name: str) -> None:
 def test_range(name: str) -> None:
     (entry,) = (entry for entry in NUMBERS if entry.name == name)
     low, high = entry.metadata["low"], entry.metadata["high"]
-    assert low <= entry.default <= high
+    assert entry.default == entry.metadata["word"] or low <= entry.default <= high
     # The other end of the pair of areas moves along, so that it does not stand in the way.
     wide = {"min_spot_area_mm2": 0.0, "max_spot_area_mm2": 10000.0}
     for value in (low, high):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import pytest
@@ -85,10 +85,12 @@ def test_defaults_are_valid_and_know_no_spacing():
 
 
 def test_values_reach_their_places():
-    options = {"threshold": 1500.0, "frame_tolerance_mm": 0.4, "scale_tolerance": 0.01, "max_target_error_mm": 5.0}
-    changed = {**DEFAULTS, "pixel_spacing": (0.5, 0.7), "pixel_shear": 0.01, **options}
+    options = RegistrationOptions(
+        threshold=1500.0, frame_tolerance_mm=0.4, scale_tolerance=0.01, max_target_error_mm=5.0
+    )
+    changed = {**DEFAULTS, **asdict(options), "pixel_spacing": (0.5, 0.7), "pixel_shear": 0.01}
     settings = NodeSettings.from_parameters(changed)
-    assert settings.options == RegistrationOptions(**options)
+    assert settings.options == options
     assert settings.scale is not None
     assert (settings.scale.sx, settings.scale.sy, settings.scale.shear) == (0.5, 0.7, 0.01)
 

@@ -37,10 +37,11 @@ def test_a_wrong_covariance_is_noticed() -> None:
     """Spots of 0.15 pixel of noise that are said to have 0.1: twice the squared error, and balls that are too small."""
     rng, frame, scanner = np.random.default_rng(4), load_frame("cube6"), ScannerSettings()
     found = PoseStatistics()
+    options = RegistrationOptions(spot_noise_px=0.1, frame_tolerance_mm=0.0, scale_tolerance=0.0)
     for _ in range(150):
         pose = random_pose(rng, frame, scanner)
         spots = project(frame, pose, scanner.scale)[0] + rng.normal(0, 0.15, (6, 2))
-        found.add(register_spots(spots, frame, scanner.scale, RegistrationOptions(spot_noise_px=0.1)), pose)
+        found.add(register_spots(spots, frame, scanner.scale, options), pose)
     assert found.accepted > 100
     assert found.nees > 6 + 4 * np.sqrt(12 / found.accepted)
     assert found.coverage.max() < 0.93

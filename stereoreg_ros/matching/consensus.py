@@ -103,7 +103,8 @@ def _near_miss_densities(off: Array, frame: Frame, cuts: Cuts, rods: NDArray[np.
     # Where the pose is wrong, so is the direction of that way.
     scale = np.hypot(math.sqrt(2.0) * _NEAR_MISS_MM, _WAY_TURNED * along)
     beside = (1.0 + (across / scale) ** 2) ** -1.5 / (2 * scale)
-    return np.asarray(np.maximum(anywhere, np.where(on_way, beside / np.maximum(length_mm[:, None], scale), 0.0)))
+    on_its_way = np.where(on_way, beside / np.maximum(length_mm[:, None], scale), 0.0)
+    return np.asarray(0.5 * (anywhere + on_its_way))
 
 
 def score(hypothesis: Hypothesis, gains: Array) -> float:
