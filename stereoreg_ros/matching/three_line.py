@@ -382,6 +382,12 @@ def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> 
     for rods in range(max(least, _FEWEST_WITHOUT_TWINS), most + 1):
         while _twin_sample(frame, rods, sigma_mm).look_at_next():
             yield
+    # Of slices with all rods or all but one, what was accepted is looked at once more.
+    for rods in range(max(least, _FEWEST_WITHOUT_TWINS), most + 1):
+        if _may_have_twins(frame, rods, sigma_mm):
+            for lines in further_triples(frame, options.min_inliers, rods, _LOOKS):
+                _solver(frame, lines, _tolerance_mm(sigma_mm)).table(rods, most)
+                yield
     begun_at = most
     # Of frames of many rods only some: the rest is for spots that are known less well.
     for lines, complete_from in order[: _SOLVERS // 2]:
