@@ -197,7 +197,7 @@ def bench(running) -> Iterator[Bench]:
 
 
 def test_pose_covariance_and_diagnostics(bench):
-    assert bench.set(max_rotation_deg=40.0) == ""
+    assert bench.set(max_rotation_deg=40.0, threshold=2000.0) == ""
     hu, slice_from_frame = rendered(2)
     stamp = bench.send(image_of(hu))
     assert_near(bench.pose(stamp), slice_from_frame)
