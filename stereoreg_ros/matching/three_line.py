@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.projection import cut
@@ -58,6 +59,8 @@ _FEWEST, _LOOKS_AT_FOUR, _LOOKS = 4, 4, 3
 _FEWEST_WITHOUT_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 32, 20.0, 0.25
 # Solvers that are kept, of a few megabytes each.
 _SOLVERS = 64
+# Probability below which a chi-square is not by the stated errors.
+_IMPLAUSIBLE = 0.01
 # Explanations that chance brings less often than this (log10) are not sought beside one that was found.
 _LOG10_RIVALS = -3.0
 
@@ -138,7 +141,10 @@ def find_better(
         better = [
             one
             for one in distinct([*search.level(level, most_chi_square, [])], gains)
-            if score(one, gains) > least_score and search.false_alarms(one) <= allowed
+            if score(one, gains) > least_score
+            and search.false_alarms(one) <= allowed
+            # What the stated errors cannot explain would not be accepted either, and speaks against nothing.
+            and one.chi_square <= chi2.isf(_IMPLAUSIBLE, 2 * one.inliers - 6)
         ]
         if better:
             return better[0]
