@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from real_images import CATPHAN_OPTIONS, catphan, height, shows_module
 
@@ -27,4 +28,7 @@ def test_scale_of_several_slices(factors):
     assert found.slices >= 5
     assert found.scale.sx == pytest.approx(true.sx, rel=0.005)
     assert found.scale.sy == pytest.approx(true.sy, rel=0.005)
-    assert max(found.standard_errors) < 0.005 * true.sx
+    # The wires are known to 0.4 mm, at 58 mm from the centre: half a per cent of the scale, whatever the slices say.
+    of_slices = np.sqrt(np.square(found.standard_errors) - np.square(found.frame_errors))
+    assert of_slices.max() < 0.002 * true.sx
+    assert max(found.frame_errors) < 0.006 * true.sx
