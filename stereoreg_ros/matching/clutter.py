@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, gammainc
@@ -26,9 +27,12 @@ _HALF_LINE_MM: Final = 0.75
 # Pitches of a square lattice that are looked for, mm; a finer one is not told from none.
 _FINEST_MM, _COARSEST_MM = 2.5, 25.0
 # Steps of wave number, as phases over the spots' extent; how far, as a share of the pitch, a spot may be off a hole.
-_PHASE_STEP, _OFF_HOLE = 0.25, 0.12
+_PHASE_STEP, _OFF_HOLE = 0.4, 0.12
 # Expected number of lattices as marked among so many wave numbers in uniform spots, below which there is one.
 _LATTICE_BY_CHANCE: Final = 0.05
+# Of lattices followed by this share of the best one's strength, the coarsest is meant.
+_AS_WELL: Final = 0.7
+_COMPLEX: Final = np.array([1.0, 1.0j])
 # So many spots nearest to the matched ones are looked at for a lattice.
 _MOST_FOR_LATTICE: Final = 80
 
@@ -99,52 +103,87 @@ def _lines(own: Array, others: Array, area_mm2: float) -> Array:
 
 
 def _lattice(own: Array, others: Array, area_mm2: float) -> Array:
-    """On the holes of a square lattice."""
+    """On the holes of a square lattice, as a template's: the matched spots may be some of these, and count as spots."""
     none = np.zeros(len(own))
-    if len(others) < _FEWEST:
-        return none
     centre = own.mean(axis=0)
     nearest = np.argsort(np.linalg.norm(others - centre, axis=1), kind="stable")[:_MOST_FOR_LATTICE]
-    others = others[nearest]
-    points = np.concatenate([own, others]) - centre
-    strongest = _strongest_wave(points)
-    if strongest is None:
+    points = np.concatenate([own, others[nearest]]) - centre
+    wave = _strongest_wave(points)
+    if wave is None:
         return none
-    wave = strongest
-    count = len(points)
-    pitch_mm = 1.0 / float(np.linalg.norm(wave))
-    phases = points @ np.stack([wave, _turned(wave)], axis=1)
-    origin = np.angle(np.exp(2j * np.pi * phases).sum(axis=0)) / (2 * np.pi)
-    off = np.abs((phases - origin + 0.5) % 1.0 - 0.5)
-    is_on = (off <= _OFF_HOLE).all(axis=1)
+    # Places as complex numbers: a lattice's rows and columns are those, turned, scaled and shifted.
+    places, turned = points @ _COMPLEX, complex(wave[0], -wave[1])
+    shift = _common_phase(turned * places)
+    is_on = _is_on_hole(turned * places - shift)
+    if is_on.sum() < _FEWEST:
+        return none
+    # Spots off the lattice have pulled at it.
+    turned, shift = _fitted(places[is_on], _nearest_hole((turned * places - shift)[is_on]))
+    is_on = _is_on_hole(turned * places - shift)
     share = (2 * _OFF_HOLE) ** 2
     on_holes = int(is_on[len(own) :].sum())
-    if on_holes < _FEWEST or bdtrc(on_holes - 1, count - len(own), share) > _CROWDED:
+    if on_holes < _FEWEST or bdtrc(on_holes - 1, len(nearest), share) > _CROWDED:
         return none
-    extent = np.maximum(np.ptp(points, axis=0) + pitch_mm, pitch_mm)
-    holes_mm2 = share * float(extent.prod())
-    return np.asarray(np.where(is_on[: len(own)], on_holes / holes_mm2, 0.0))
+    holes = _nearest_hole((turned * places - shift)[len(own) :][is_on[len(own) :]])
+    if min(len(np.unique(holes.real)), len(np.unique(holes.imag))) < _FEWEST:
+        return none  # spots along a line mark no rows beside it
+    extent = np.ptp(points, axis=0) + 1.0 / abs(turned)
+    density = on_holes / (share * float(extent.prod()))
+    return np.asarray(np.where(is_on[: len(own)], density, 0.0))
+
+
+def _nearest_hole(places: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Row and column of the hole nearest to places (n,), in units of the pitch."""
+    return np.asarray(np.rint(places.real) + 1j * np.rint(places.imag))
+
+
+def _is_on_hole(places: NDArray[np.complex128]) -> NDArray[np.bool_]:
+    """Which places (n,), in units of the pitch, are near a hole."""
+    off = places - _nearest_hole(places)
+    return np.asarray((np.abs(off.real) <= _OFF_HOLE) & (np.abs(off.imag) <= _OFF_HOLE))
+
+
+def _common_phase(places: NDArray[np.complex128]) -> complex:
+    """By how much most places (n,) are off the whole numbers, in both directions."""
+    along, across = (np.angle(np.exp(2j * np.pi * part).sum()) / (2 * np.pi) for part in (places.real, places.imag))
+    return complex(along, across)
+
+
+def _fitted(places: NDArray[np.complex128], holes: NDArray[np.complex128]) -> tuple[complex, complex]:
+    """The turn and shift by which turned * places - shift comes closest to the holes (n,), by least squares."""
+    off = places - places.mean()
+    turned = complex(np.vdot(off, holes) / np.vdot(off, off))
+    return turned, complex(turned * places.mean() - holes.mean())
 
 
 def _strongest_wave(points: Array) -> Array | None:
-    """Wave number (2,) 1/mm of the square lattice that points (s, 2) mm follow best; None where that may be by chance.
+    """Wave number (2,) 1/mm of the square lattice that points (s, 2) mm follow; None where that may be by chance.
 
     A lattice is followed as far as the phases of the points along its two axes agree. Of uniform points the squared
-    sums of phases over the number of points are distributed exponentially, those of two axes by a Gamma law.
+    sums of phases over the number of points are distributed exponentially, those of two axes by a Gamma law. What lies
+    on a lattice lies on finer ones too: of those followed about as well the coarsest is meant.
     """
     step = _PHASE_STEP / max(float(np.ptp(points, axis=0).max()), _FINEST_MM)
     ticks = step * np.arange(int(1.0 / _FINEST_MM / step) + 1)
-    along_x, along_y = (np.exp(2j * np.pi * np.outer(ticks, points[:, axis])) for axis in (0, 1))
-    # At (a, b) of the ticks the wave, and at right angles to it (-b, a).
-    strength = np.abs(along_x @ along_y.T) ** 2 + np.abs(along_x.conj() @ along_y.T).T ** 2
-    strength /= len(points)
-    size = np.hypot(ticks[:, None], ticks)
-    tried = (size <= 1.0 / _FINEST_MM) & (size >= 1.0 / _COARSEST_MM) & (ticks > 0)[:, None]
-    strength[~tried] = 0.0
-    row, column = np.unravel_index(int(strength.argmax()), strength.shape)
-    most = float(strength[row, column])
-    if tried.sum() * (1.0 + most) * math.exp(-most) > _LATTICE_BY_CHANCE:
+    # Both axes together make at most twice as much as there are points.
+    tried = 0.25 * math.pi * len(ticks) ** 2
+    if tried * _by_chance(2.0 * len(points)) > _LATTICE_BY_CHANCE:
         return None
+    phase_x, phase_y = (2 * np.pi * np.outer(ticks, points[:, axis]).astype(np.float32) for axis in (0, 1))
+    cos_x, sin_x, cos_y, sin_y = np.cos(phase_x), np.sin(phase_x), np.cos(phase_y).T, np.sin(phase_y).T
+    # At (a, b) of the ticks the wave, and at right angles to it (-b, a).
+    both_cos, both_sin, sin_cos, cos_sin = cos_x @ cos_y, sin_x @ sin_y, sin_x @ cos_y, cos_x @ sin_y
+    strength = (both_cos - both_sin) ** 2 + (sin_cos + cos_sin) ** 2
+    strength += ((both_cos + both_sin) ** 2 + (sin_cos - cos_sin) ** 2).T
+    strength /= len(points)
+    size = ticks[:, None] ** 2 + ticks**2
+    strength[(size > _FINEST_MM**-2) | (size < _COARSEST_MM**-2) | (ticks <= 0)[:, None]] = 0.0
+    most = float(strength.max())
+    if tried * _by_chance(most) > _LATTICE_BY_CHANCE:
+        return None
+    highest = (strength >= _AS_WELL * most) & (strength == cv2.dilate(strength, np.ones((5, 5), np.uint8)))
+    peaks = np.argwhere(highest)
+    row, column = peaks[size[highest].argmin()]
     # Between the steps.
     offsets = step * np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 9)] * 2), axis=-1).reshape(-1, 2)
     fine = np.array([ticks[row], ticks[column]]) + offsets
@@ -155,8 +194,9 @@ def _strongest_wave(points: Array) -> Array | None:
     return np.asarray(fine[int(np.argmax(sums))])
 
 
-def _turned(wave: Array) -> Array:
-    return np.array([-wave[1], wave[0]])
+def _by_chance(strength: float) -> float:
+    """Probability that uniform points follow a given lattice so well or better."""
+    return (1.0 + strength) * math.exp(-strength)
 
 
 def _is_crowded(count: int, expected: float) -> bool:
