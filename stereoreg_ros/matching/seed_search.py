@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +50,17 @@ class Starts(NamedTuple):
     def take(self, rows: slice) -> Starts:
         """Only the given ones."""
         return Starts(self.rotations[rows], self.translations[rows], self.spot_of_line[rows], self.origin[rows])
+
+
+def joined(starts: Sequence[Starts]) -> Starts:
+    """All of them, with origins of their own."""
+    first = np.cumsum([0, *(int(one.origin.max(initial=-1)) + 1 for one in starts)])
+    return Starts(
+        np.concatenate([one.rotations for one in starts]),
+        np.concatenate([one.translations for one in starts]),
+        np.concatenate([one.spot_of_line for one in starts]),
+        np.concatenate([one.origin + number for one, number in zip(starts, first, strict=False)]),
+    )
 
 
 class SeedSearch(NamedTuple):

@@ -32,7 +32,7 @@ from stereoreg_ros.matching.consensus import (
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.pose_volume import plane_sample, typical_slices
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.seed_search import SeedSearch, Starts, search_seeds
+from stereoreg_ros.matching.seed_search import SeedSearch, Starts, joined, search_seeds
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.significance import share_of
 from stereoreg_ros.matching.spots import Spots
@@ -98,13 +98,15 @@ def match(
                 most_chi_square = 2 * (
                     level * gains.max() - score(found[0], gains) + apart * math.log(10) + EVIDENCE_SLACK
                 )
-                if most_chi_square < 0 or search.is_told_apart(level, found[0], apart):
+                # Of as many rods as the best has, a twin is a rival however lucky the best one's residuals are.
+                fewer = level < found[0].inliers
+                if most_chi_square < 0 or (fewer and search.is_told_apart(level, found[0], apart)):
                     break
                 further = search.level if search.has_rivals(level, most_chi_square) else search.level_of_twins
                 found = distinct([*found, *further(level, most_chi_square, found)], gains)
             least_rods = level
         if found and (known or search.is_acceptable(found[0])):
-            found = distinct([*found, *search.twins_of(found)], gains)
+            found = distinct([*found, *search.twins_of(found, looks_twice=not known)], gains)
         elif least_rods == _FEWEST <= len(frame):
             # One triple is all that a set of four rods has been tried by: no level below finds what it has missed.
             found = distinct([*found, *search.second_look(_FEWEST, found)], gains)
@@ -112,6 +114,8 @@ def match(
                 found = distinct([*found, *search.twins_of(found)], gains)
     except SearchGivenUpError:
         return Found([], least_rods, "given up: too many of them look like parts of the frame")
+    if known and len(found) == 1:
+        return Found(found, least_rods)  # it has been judged
     return Found(judged(found, spots, frame, prior, apart), least_rods)
 
 
@@ -225,11 +229,17 @@ class _Search:
     def _from_triple(
         self, lines: tuple[int, int, int], level: int, most_chi_square: float, known: list[Hypothesis]
     ) -> Iterator[Hypothesis]:
+        for starts in self._starts_from_triple(lines, level, most_chi_square, known):
+            yield from self._settled(starts)
+
+    def _starts_from_triple(
+        self, lines: tuple[int, int, int], level: int, most_chi_square: float, known: list[Hypothesis]
+    ) -> Iterator[Starts]:
         for seeds in self._seeds(lines, level):
             starts = seeds.reaching(level, most_chi_square, known)
             self._spend(_WORK_OF_START * starts.spot_of_line.size / 6 * (1 + len(self._spots.mm) / _FEW_SPOTS))
             for first in range(0, len(starts.spot_of_line), _CHUNK):
-                yield from self._settled(starts.take(slice(first, first + _CHUNK)))
+                yield starts.take(slice(first, first + _CHUNK))
 
     def _settled(self, starts: Starts) -> Iterator[Hypothesis]:
         if not len(starts.origin):
@@ -240,27 +250,36 @@ class _Search:
 
     def second_look(self, level: int, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """Explanations of so many rods, or more, besides the known, from further triples of rods than `level` tried."""
+        for starts in self._second_starts(level, known):
+            yield from self._settled(starts)
+
+    def _second_starts(self, level: int, known: list[Hypothesis]) -> Iterator[Starts]:
         looks = _LOOKS_AT_FOUR if level == _FEWEST else _LOOKS
         for lines in further_triples(self._frame, self._options.min_inliers, level, looks):
-            yield from self._from_triple(lines, level, math.inf, known)
+            yield from self._starts_from_triple(lines, level, math.inf, known)
 
     def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """The same as `level`, but only from the spots of the best explanation known."""
         search, here, rows = self._among_own(known)
         return self._renumbered(search.level(level, most_chi_square, here), rows)
 
-    def twins_of(self, known: list[Hypothesis]) -> Iterator[Hypothesis]:
+    def twins_of(self, known: list[Hypothesis], looks_twice: bool = True) -> Iterator[Hypothesis]:
         """Twins of the best explanation, made of its spots, that one triple of rods may have missed.
 
         The true pose may be the one that was missed, and what was found its twin: no level below would tell, as it
-        seeks what comes near the best with fewer rods.
+        seeks what comes near the best with fewer rods. looks_twice: whether further triples are tried of six rods or
+        more. Near a pose that was accepted before they have been, and one triple hardly ever misses a twin.
         """
-        yield from self._settled(starts_along_valley(known[0]))
-        yield from self._settled(_starts_without_one(known[0]))
+        starts = [starts_along_valley(known[0]), _starts_without_one(known[0])]
         rods = known[0].inliers
-        if _may_have_twins(self._frame, rods, self._spots.sigma_mm):
+        if rods < _FEWEST_WITHOUT_TWINS or (looks_twice and _has_twins(self._frame, rods, self._spots.sigma_mm)):
             search, here, rows = self._among_own(known)
-            yield from self._renumbered(search.second_look(rods, here), rows)
+            if search is self:
+                starts += self._second_starts(rods, here)
+            else:
+                yield from self._renumbered(search.second_look(rods, here), rows)
+        # What all of them lead to costs little more than what one of them does.
+        yield from self._settled(joined(starts))
 
     def _among_own(self, known: list[Hypothesis]) -> tuple[_Search, list[Hypothesis], NDArray[np.intp]]:
         """The search among the spots of the best explanation known; what is known, in terms of these; their rows."""
@@ -314,13 +333,13 @@ def _starts_without_one(hypothesis: Hypothesis) -> Starts:
     return Starts(rotations, translations, spot_of_line, np.arange(len(lines)))
 
 
-def _may_have_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:
-    """Whether so many spots of the frame, known to sigma_mm, may have twins, so that these are looked for once more.
+def _has_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:
+    """Whether so many spots of the frame, known to sigma_mm, have twins in some typical slice.
 
     The distances between k spots set 2k - 3 conditions to the six numbers of two slices that show the same: four spots
     have twins, and five near ones. From six on few slices have them, unless the frame is nearly symmetric.
     """
-    return rods < _FEWEST_WITHOUT_TWINS or _twin_sample(frame, rods, sigma_mm).any()
+    return _twin_sample(frame, rods, sigma_mm).any()
 
 
 class _TwinSample:
@@ -390,7 +409,7 @@ def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> 
             yield
     # Of slices with all rods or all but one, what was accepted is looked at once more.
     for rods in range(max(least, _FEWEST_WITHOUT_TWINS), most + 1):
-        if _may_have_twins(frame, rods, sigma_mm):
+        if _has_twins(frame, rods, sigma_mm):
             for lines in further_triples(frame, options.min_inliers, rods, _LOOKS):
                 _solver(frame, lines, _tolerance_mm(sigma_mm)).table(rods, most)
                 yield
