@@ -63,6 +63,11 @@ def lucky_chi_square(inliers: int) -> float:
     return 2 * float(gammaincinv(inliers - 3, _LUCK))
 
 
+def most_chi_square_of(inliers: int, decades: float) -> float:
+    """Chi-square with which chance brings a match of so many rods so many decades more often than the luckiest."""
+    return lucky_chi_square(inliers) * float(10.0 ** (decades / (inliers - 3)))
+
+
 def area_of_uniform_mm2(spots_mm: Array, slice_area_mm2: float | None) -> float:
     """Area in mm^2 over which uniform spots (s, 2) mm fall: the slice's.
 

@@ -34,7 +34,7 @@ from stereoreg_ros.matching.pose_volume import plane_sample, typical_slices
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, Starts, joined, search_seeds
 from stereoreg_ros.matching.settling import settle
-from stereoreg_ros.matching.significance import share_of
+from stereoreg_ros.matching.significance import most_chi_square_of, share_of
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.matching.triple_order import further_triples, triple_order
@@ -137,17 +137,22 @@ def find_better(
     gains = spots.gains(frame)
     search = _Search(spots, frame, prior, options)
     for level in search.levels:
-        most_chi_square = 2 * (level * gains.max() - least_score)
         # What matches of so many rods have to share with those of other numbers does not count here.
         allowed = allowed_log10 - math.log10(share_of(level, len(frame)))
-        if level < fewest or most_chi_square < 0 or search.least_false_alarms(level) > allowed:
+        decades_left = allowed - search.least_false_alarms(level)
+        if level < fewest or level * gains.max() < least_score or decades_left < 0:
             break
+        # What the stated errors cannot explain would not be accepted either, and speaks against nothing.
+        most_chi_square = min(
+            2 * (level * gains.max() - least_score),
+            float(chi2.isf(_IMPLAUSIBLE, 2 * level - 6)),
+            most_chi_square_of(level, decades_left),
+        )
         better = [
             one
             for one in distinct([*search.level(level, most_chi_square, [])], gains)
             if score(one, gains) > least_score
             and search.false_alarms(one) <= allowed
-            # What the stated errors cannot explain would not be accepted either, and speaks against nothing.
             and one.chi_square <= chi2.isf(_IMPLAUSIBLE, 2 * one.inliers - 6)
         ]
         if better:
