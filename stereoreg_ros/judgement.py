@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -27,9 +28,9 @@ WEAK_ROTATION_DEG: Final = 0.75
 _IMPLAUSIBLE, _DOUBTFUL = 0.01, 0.05
 # Of a scale that fits the spots so much better than the stated one.
 _SCALE_IMPLAUSIBLE = 5e-3
-# Log-likelihood by which unmatched spots beside rods that must show, and have none, may speak against a pose: one frame
+# Log-likelihood by which unmatched spots beside rods that have none, and a poor fit, may speak for a mistake: one slice
 # in a thousand is taken not to be as it was described.
-_MOST_NEAR_MISSES = math.log(1000.0)
+_MOST_EVIDENCE = math.log(1000.0)
 # Poses whose rotations differ by less cannot be told apart by a nominal orientation.
 _SAME_ORIENTATION_DEG = 10.0
 # Of several poses, how many a sentence lists.
@@ -132,12 +133,13 @@ def _residual(
 ) -> Verdict | None:
     """A residual that the stated errors cannot have caused, or that another scale removes."""
     best = estimates[0]
-    if best.scale_misfit > chi2.isf(_SCALE_IMPLAUSIBLE, 2):
+    misfit = best.scale_misfit
+    if misfit.probability < _SCALE_IMPLAUSIBLE:
         return Verdict(
             "contradicted",
             f"the {best.inliers} matched rods fit far better with another pixel spacing or size of the frame: "
-            f"chi-square falls by {best.scale_misfit:.0f} where the spacing is free; it was stated as known to "
-            f"{100 * options.scale_tolerance:g} %. Check pixel_spacing and the frame file",
+            f"chi-square falls by {misfit.fall:.0f} where the spacing is free; it was stated as known to "
+            f"{100 * misfit.stated:.2g} %. Check pixel_spacing and the frame file",
         )
     if _plausibility(best) < _IMPLAUSIBLE:
         return Verdict(
@@ -177,13 +179,16 @@ def _near_misses(
     found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
 ) -> Verdict | None:
     best = found.hypotheses[0]
-    if best.near_misses <= _MOST_NEAR_MISSES:
+    # The residual and what another scale takes from it are no two witnesses.
+    probability = min(_plausibility(estimates[0]), estimates[0].scale_misfit.probability)
+    if best.near_misses + _evidence(probability) <= _MOST_EVIDENCE:
         return None
+    both = "" if best.near_misses > _MOST_EVIDENCE else ", and those matched do not fit well"
     return Verdict(
         "contradicted",
         f"{best.inliers} of {len(frame)} rods are matched, but beside the places of others, which have no spot, there "
-        "are unmatched spots that would be theirs if something were slightly wrong: check frame file, pixel spacing "
-        "and nominal orientation",
+        f"are unmatched spots that would be theirs if something were slightly wrong{both}: check frame file, pixel "
+        "spacing and nominal orientation",
     )
 
 
@@ -230,6 +235,14 @@ def _caution(best: PoseEstimate, options: RegistrationOptions) -> str:
             "no nominal orientation is configured: one slice cannot show a mirrored image or a left-handed frame file"
         )
     return "; ".join(cautions)
+
+
+def _evidence(probability: float) -> float:
+    """The most that so small a probability says against a hypothesis, log (Sellke, Bayarri and Berger 2001)."""
+    if probability >= math.exp(-1.0):
+        return 0.0
+    probability = max(probability, sys.float_info.min)
+    return -math.log(-math.e * probability * math.log(probability))
 
 
 def _plausibility(best: PoseEstimate) -> float:

@@ -367,6 +367,7 @@ def _whitened(
         (whitening @ residual[..., None]).reshape(count),
         shifts,
         is_scale,
+        spots.tolerances.scale_std,
     )
 
 

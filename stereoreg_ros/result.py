@@ -13,7 +13,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
-from stereoreg_ros.uncertainty import error_ball_95, point_covariance
+from stereoreg_ros.uncertainty import ScaleMisfit, error_ball_95, point_covariance
 
 Reason = Literal[
     "too_few_spots",
@@ -68,9 +68,8 @@ class PoseEstimate:
     slice_from_frame, scanner_from_frame: the pose, mm. covariance: (6, 6), position (mm) then rotation vector (rad),
     in scanner axes, of the perturbation of `Pose.perturbed` on scanner_from_frame; this is the order of ROS.
     chi_square: sum of the squared residuals over the noise, with `degrees_of_freedom`.
-    log10_false_alarms: log10 of how many as good explanations chance alone would bring. scale_misfit: by how much
-    chi-square falls where the pixel spacing is free; by the stated errors alone it is chi-square distributed, with two
-    degrees of freedom.
+    log10_false_alarms: log10 of how many as good explanations chance alone would bring. scale_misfit: how much better
+    the spots fit with another pixel spacing.
     """
 
     slice_from_frame: Pose
@@ -79,7 +78,7 @@ class PoseEstimate:
     matches: tuple[Match, ...]
     chi_square: float
     log10_false_alarms: float
-    scale_misfit: float = 0.0
+    scale_misfit: ScaleMisfit = field(default_factory=ScaleMisfit)
 
     @property
     def inliers(self) -> int:

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
+from scipy.stats import chi2
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, skew
@@ -48,12 +49,31 @@ def point_covariance(covariance: Array, scanner_from_frame: Pose, point_in_frame
     return moved
 
 
+class ScaleMisfit(NamedTuple):
+    """How much better spots fit with another scale.
+
+    fall: by how much chi-square falls where the scale is free instead of known as well as stated; where all is as
+    stated it is distributed as chi-square of degrees_of_freedom, one for each error of the scale. stated: standard
+    deviation of the scale, as a share of it.
+    """
+
+    fall: float = 0.0
+    degrees_of_freedom: int = 0
+    stated: float = 0.0
+
+    @property
+    def probability(self) -> float:
+        """Of as large a fall by the stated errors alone; one where the scale is not judged."""
+        return float(chi2.sf(self.fall, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
+
+
 class Whitened(NamedTuple):
     """The residuals of k rods at a pose slice_from_frame, in standard deviations, and what moves them.
 
     by_pose: (2k, 6), their Jacobian by the pose (see `Pose.perturbed`); by_common: (2k, c), by errors that all spots
     share, of unit variance each; residual: (2k,), spot less prediction. shifts: (6, c), how far each of these errors
-    moves the pose besides, as it moves all spots alike. scale: (c,), which of them are errors of the scale.
+    moves the pose besides, as it moves all spots alike. scale: (c,), which of them are errors of the scale; scale_std:
+    standard deviation of the scale, as a share of it.
     """
 
     by_pose: Array
@@ -61,6 +81,7 @@ class Whitened(NamedTuple):
     residual: Array
     shifts: Array
     scale: NDArray[np.bool_]
+    scale_std: float = 0.0
 
     def covariance_by_shifts(self) -> Array:
         """What is to be added for the shifts to the pose's covariance (6, 6), the inverse of its information.
@@ -75,14 +96,10 @@ class Whitened(NamedTuple):
         added: Array = cross + cross.T + self.shifts @ self.shifts.T
         return added
 
-    def scale_misfit(self) -> float:
-        """By how much chi-square falls where the scale is free instead of known as well as stated.
-
-        Where everything is as stated it is distributed as chi-square, with a degree of freedom for each error of the
-        scale.
-        """
+    def scale_misfit(self) -> ScaleMisfit:
+        """How much better the spots fit with another scale."""
         if not self.scale.any():
-            return 0.0
+            return ScaleMisfit()
         estimated = np.linalg.solve(
             np.eye(self.by_common.shape[1]) + self.by_common.T @ self.by_common, self.by_common.T @ self.residual
         )[self.scale]
@@ -93,7 +110,8 @@ class Whitened(NamedTuple):
         information = free.T @ free - free.T @ rest @ np.linalg.pinv(inner, hermitian=True) @ rest.T @ free
         values, vectors = np.linalg.eigh(information)
         along = vectors.T @ estimated
-        return float((along**2 * (1.0 + 1.0 / np.maximum(values, _LEAST_INFORMATION))).sum())
+        fall = float((along**2 * (1.0 + 1.0 / np.maximum(values, _LEAST_INFORMATION))).sum())
+        return ScaleMisfit(fall, len(values), self.scale_std)
 
 
 def checked_scale_covariance(scale_covariance: ArrayLike) -> Array:

@@ -32,6 +32,7 @@ from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from stereoreg_ros.simulation import ScannerSettings, centred_pose, random_pose
 from stereoreg_ros.simulation.mistakes import Surroundings, contradicted_prior, sister
+from stereoreg_ros.uncertainty import ScaleMisfit
 
 FRAME = load_frame("cube6")
 SCANNER = ScannerSettings()
@@ -49,7 +50,7 @@ def estimate(rods: int = 6, pose: Pose | None = None, first_spot: int = 0) -> Po
     at, aside = np.zeros(2), np.array([0.3, 0.4])
     matches = tuple(Match(FRAME.line_names[row], row, first_spot + row, at, at + aside, 0.25) for row in range(rods))
     where = pose or Pose(np.eye(3), np.array([12.0, -3.5, 400.0]))
-    return PoseEstimate(where, where, SURE, matches, 2.0 * rods - 6, -9.0, 1.0)
+    return PoseEstimate(where, where, SURE, matches, 2.0 * rods - 6, -9.0, ScaleMisfit(1.0, 2, 0.002))
 
 
 def hypothesis(rods: int = 6, pose: Pose | None = None, near_misses: float = 0.0) -> Hypothesis:
@@ -222,10 +223,11 @@ class TestResidual:
 
 
 class TestScale:
+    @pytest.mark.parametrize("freedom", [2, 3])
     @pytest.mark.parametrize(("probability", "reason"), [(4.9e-3, "contradicted"), (5.1e-3, None)])
-    def test_that_fits_far_better_contradicts(self, probability: float, reason: str | None) -> None:
-        misfit = float(chi2.isf(probability, 2))
-        verdict = judged(replace(estimate(), scale_misfit=misfit))
+    def test_that_fits_far_better_contradicts(self, probability: float, reason: str | None, freedom: int) -> None:
+        misfit = float(chi2.isf(probability, freedom))
+        verdict = judged(replace(estimate(), scale_misfit=ScaleMisfit(misfit, freedom, 0.002)))
         assert verdict.reason == reason
         if reason:
             assert "6 matched rods fit far better with another pixel spacing or size of the frame" in verdict.message
@@ -234,7 +236,7 @@ class TestScale:
             assert "pixel_spacing and the frame file" in verdict.message
 
     def test_is_told_before_the_residual_that_it_causes(self) -> None:
-        both = replace(estimate(), scale_misfit=50.0, chi_square=70.0)
+        both = replace(estimate(), scale_misfit=ScaleMisfit(50.0, 2, 0.002), chi_square=70.0)
         assert judged(both).reason == "contradicted"
 
 
@@ -269,7 +271,7 @@ class TestSeveralPoses:
 class TestNearMisses:
     @pytest.mark.parametrize(("factor", "reason"), [(1.01, "contradicted"), (0.99, None)])
     def test_speak_against_a_pose(self, factor: float, reason: str | None) -> None:
-        most = judgement._MOST_NEAR_MISSES
+        most = judgement._MOST_EVIDENCE
         # One frame in some hundreds to thousands is not as described.
         assert math.log(100) < most < math.log(1e4)
         verdict = judged(estimate(), near_misses=factor * most)
@@ -278,6 +280,17 @@ class TestNearMisses:
             assert "6 of 6 rods are matched, but beside the places of others" in verdict.message
             for told in ("frame file", "pixel spacing", "nominal orientation"):
                 assert told in verdict.message
+
+    @pytest.mark.parametrize(("near_misses", "probability", "reason"), [(5.5, 0.02, "contradicted"), (5.5, 0.3, None)])
+    def test_and_a_poor_fit_speak_together(self, near_misses: float, probability: float, reason: str | None) -> None:
+        """The same of a scale that fits better, and of the residual: 0.02 makes up for a factor of four to five."""
+        assert judged(estimate(), near_misses=near_misses).reason is None
+        scale = ScaleMisfit(float(chi2.isf(probability, 2)), 2, 0.002)
+        residual = float(chi2.isf(probability, 6))
+        for doubted in (replace(estimate(), scale_misfit=scale), replace(estimate(), chi_square=residual)):
+            verdict = judged(doubted, near_misses=near_misses)
+            assert verdict.reason == reason
+            assert ("those matched do not fit well" in verdict.message) == bool(reason)
 
 
 class TestPrecision:
@@ -345,7 +358,9 @@ class TestOrder:
     def test_chance_comes_first(self) -> None:
         """What chance could bring has no residual to be judged, and twins."""
         verdict = judged(
-            replace(estimate(), log10_false_alarms=-1.0, chi_square=99.0, scale_misfit=99.0), estimate(), near_misses=99
+            replace(estimate(), log10_false_alarms=-1.0, chi_square=99.0, scale_misfit=ScaleMisfit(99.0, 2, 0.002)),
+            estimate(),
+            near_misses=99,
         )
         assert verdict.reason == "no_consensus"
 

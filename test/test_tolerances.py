@@ -298,7 +298,8 @@ class TestChiSquare:
             estimates = [result.estimate] if result else result.estimates
             if len(estimates) == 1 and estimates[0].inliers == len(frame):
                 residuals.append(estimates[0].chi_square)
-                misfits.append(estimates[0].scale_misfit)
+                misfits.append(estimates[0].scale_misfit.fall)
+                assert estimates[0].scale_misfit.degrees_of_freedom == (3 if errors.measured else 2)
         assert len(residuals) > 0.95 * sets
         freedom, modes = 2 * len(frame) - 6, 3 if errors.measured else 2
         for values, mean in ((residuals, freedom), (misfits, modes)):

@@ -9,6 +9,7 @@ from scipy.stats import chi2, kstest
 
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.uncertainty import (
+    ScaleMisfit,
     Whitened,
     checked_scale_covariance,
     error_ball_95,
@@ -191,25 +192,26 @@ class TestWhitened:
         for _ in range(20):
             given = whitened(rng, rods)
             fall = chi_square(given, np.zeros(3, dtype=bool)) - chi_square(given, given.scale)
-            assert given.scale_misfit() == pytest.approx(fall, rel=1e-7)
+            assert given.scale_misfit().fall == pytest.approx(fall, rel=1e-7)
 
     @pytest.mark.parametrize("scales", [2, 3])
     def test_scale_misfit_of_stated_errors_is_chi_square_distributed(self, scales: int) -> None:
         rng = np.random.default_rng(9)
-        values = [whitened(rng, 7, scales).scale_misfit() for _ in range(1500)]
-        assert kstest(values, chi2(scales).cdf).pvalue > 1e-3
+        misfits = [whitened(rng, 7, scales).scale_misfit() for _ in range(1500)]
+        assert kstest([one.fall for one in misfits], chi2(scales).cdf).pvalue > 1e-3
+        assert kstest([one.probability for one in misfits], "uniform").pvalue > 1e-3
 
     def test_a_scale_that_nothing_shows_is_not_judged(self) -> None:
         """Three rods fit any scale: what they say of it is rounding."""
         rng = np.random.default_rng(10)
-        values = [whitened(rng, 3).scale_misfit() for _ in range(50)]
+        values = [whitened(rng, 3).scale_misfit().fall for _ in range(50)]
         assert max(values) < 1e-3
 
     def test_a_scale_without_an_error_has_no_misfit(self) -> None:
         given = whitened(np.random.default_rng(11), 6, scales=0, others=2)
-        assert given.scale_misfit() == 0.0
+        assert given.scale_misfit() == ScaleMisfit()
         none = whitened(np.random.default_rng(12), 6, scales=0, others=0)
-        assert none.scale_misfit() == 0.0
+        assert none.scale_misfit().probability == 1.0
         assert none.covariance_by_shifts().shape == (6, 6)
 
 

@@ -80,8 +80,8 @@ def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
     density = _near_miss_densities(off, frame, cuts, possible).max(axis=1)
     evidence = np.log(density / spots.clutter_density(frame))
     # That the image reaches there, the spot shows.
-    cost = MISSING_COST * _well_within_ends(frame, cuts)[possible]
-    return float(np.where(evidence > 0, evidence + cost, 0.0).sum())
+    evidence = evidence + MISSING_COST * _well_within_ends(frame, cuts)[possible]
+    return float(np.maximum(evidence, 0.0).sum())
 
 
 def _near_miss_densities(off: Array, frame: Frame, cuts: Cuts, rods: NDArray[np.bool_]) -> Array:

@@ -58,15 +58,20 @@ class Tolerances(NamedTuple):
         matrices[:, 0, 0], matrices[:, 1, 1], matrices[:, 0, 1] = modes
         stretches = matrices @ scale.inverse_matrix
         radius = float(np.linalg.norm(np.ptp(np.concatenate([frame.starts, frame.ends]), axis=0))) / 2
-        most = float(np.linalg.norm(stretches, ord=2, axis=(1, 2)).max(initial=0.0))
         half_mm = thickness_mm / 2 if thickness_mm > 0 else _HALF_UNKNOWN_MM
-        extent_mm = float(np.hypot(_OF_ROD * rod_mm.max(initial=0.0), _OF_RADIUS * most * radius))
+        off_mm = _OF_RADIUS * _largest(stretches) * radius
+        extent_mm = float(np.hypot(_OF_ROD * rod_mm.max(initial=0.0), off_mm))
         return cls(rod_mm, stretches, half_mm, extent_mm)
 
     @classmethod
     def none(cls, frame: Frame) -> Tolerances:
         """Everything is as the frame file and the scale have it, in a slice without thickness."""
         return cls(np.zeros(len(frame)), np.zeros((0, 2, 2)), 0.0, 0.0)
+
+    @property
+    def scale_std(self) -> float:
+        """Standard deviation of the scale, as a share of it, in the direction in which it is largest."""
+        return _largest(self.stretches)
 
     def rod_covariances(self, frame: Frame, cuts: Cuts) -> Array:
         """Covariances (..., n, 2, 2) mm^2 of where the rods are cut; zero where a rod runs within the slice."""
@@ -100,3 +105,8 @@ class Tolerances(NamedTuple):
                 shift -= sign * np.copysign(missing, cosine)
             shifts = shift[..., None] * slope
         return np.nan_to_num(shifts, posinf=0.0, neginf=0.0)
+
+
+def _largest(stretches: Array) -> float:
+    """By how much the largest of stretches (k, 2, 2) stretches."""
+    return float(np.linalg.norm(stretches, ord=2, axis=(1, 2)).max(initial=0.0))
