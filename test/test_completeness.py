@@ -218,3 +218,31 @@ def test_second_pose_in_the_valley_of_a_lucky_one_is_a_rival() -> None:
     assert not result
     assert result.reason == "ambiguous"
     assert [round(one.chi_square, 1) for one in result.estimates] == [0.1, 4.1]
+
+
+def test_five_rods_are_found_where_the_triple_tried_lies_in_a_line():
+    """Of cube6 without one of rods 0, 4 and 5 the triple of rods 1, 2 and 3 is all that is tried at first."""
+    frame, rng = load_frame("cube6"), np.random.default_rng(11)
+    settings = SpotSetSettings(SCANNER, 6, 0, 0.3)
+    options = RegistrationOptions(frame_tolerance_mm=0.0, scale_tolerance=0.0, max_target_error_mm=1000.0)
+    found = drawn = 0
+    while drawn < 25:
+        sample = random_spot_set(rng, frame, settings)
+        predicted, _ = project(frame, sample.slice_from_frame, SCANNER.scale)
+        spot_of = np.linalg.norm(predicted[:, None] - sample.spots_px, axis=2).argmin(axis=1)
+        a, b, c = sample.spots_px[spot_of[[1, 2, 3]]]
+        sides = b - a, c - a
+        flatness = abs(sides[0][0] * sides[1][1] - sides[0][1] * sides[1][0]) / max(side @ side for side in sides)
+        if flatness > 0.02:
+            continue
+        drawn += 1
+        seen = np.delete(sample.spots_px, spot_of[rng.choice([0, 4, 5])], axis=0)
+        result = register_spots(seen, frame, SCANNER.scale, options, slice_area_mm2=AREA_MM2)
+        estimates = [result.estimate] if result else result.estimates
+        found += any(
+            one.inliers == 5
+            and np.linalg.norm(one.slice_from_frame.translation - sample.slice_from_frame.translation) < 10
+            for one in estimates
+        )
+    print(f"{found} of {drawn}")
+    assert found >= drawn - 1

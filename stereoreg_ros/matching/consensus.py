@@ -44,6 +44,8 @@ EVIDENCE_SLACK = 2.5
 # How far a rod's own spot lies from where a wrong pose has the rod: Student's distribution of two degrees of freedom in
 # the plane, of this scale per axis, as most mistakes move it by a few millimetres and some by a centimetre.
 _NEAR_MISS_MM = 2.0
+# So near to a spot of another rod a rod without one may be taken for it.
+_SHARED_SPOT_MM = 5.0
 # By how much, rad, a wrong pose turns the way that a leaning rod's spot takes.
 _WAY_TURNED = 0.2
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
@@ -68,28 +70,36 @@ def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
 
     A rod may fail to show, and a false spot may lie anywhere; that it lies just beside the place of such a rod is much
     likelier where it is the rod's own, and the pose, the frame file or the pixel spacing is wrong by a few millimetres.
+    Where a rod without a spot is cut beside the spot of another one, as where two of them meet, that spot may be its
+    own, and the unmatched one that of the other rod.
     """
     others = np.setdiff1d(np.arange(len(spots.mm)), hypothesis.spot_of_line)
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
+    matched = hypothesis.spot_of_line != UNMATCHED
     with np.errstate(invalid="ignore"):
         possible = (cuts.lambdas >= frame.lambda_min - END_SLACK_MM) & (cuts.lambdas <= frame.lambda_max + END_SLACK_MM)
-        possible &= (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE) & (hypothesis.spot_of_line == UNMATCHED)
+        possible &= (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE) & ~matched
     if not possible.any() or not len(others):
         return 0.0
-    off = spots.mm[others] - cuts.points_mm[possible][:, None]
-    density = _near_miss_densities(off, frame, cuts, possible).max(axis=1)
-    evidence = np.log(density / spots.clutter_density(frame))
-    # That the image reaches there, the spot shows.
-    evidence = evidence + MISSING_COST * _well_within_ends(frame, cuts)[possible]
-    return float(np.maximum(evidence, 0.0).sum())
+    rods = np.flatnonzero(possible | matched)
+    evidence = np.log(_near_miss_densities(spots.mm[others], frame, cuts, rods) / spots.clutter_density(frame))
+    best = np.full(len(frame), -np.inf)
+    best[rods] = evidence.max(axis=1)
+    apart = np.linalg.norm(cuts.points_mm[possible, None] - spots.mm[hypothesis.spot_of_line], axis=2)
+    shares = (apart <= _SHARED_SPOT_MM) & matched
+    best_of_possible = np.maximum(best[possible], np.where(shares, best, -np.inf).max(axis=1))
+    # That the image reaches there, the spot shows; and two rods are seldom cut at one place.
+    cost = MISSING_COST * (_well_within_ends(frame, cuts)[possible] | shares.any(axis=1))
+    return float(np.maximum(best_of_possible + cost, 0.0).sum())
 
 
-def _near_miss_densities(off: Array, frame: Frame, cuts: Cuts, rods: NDArray[np.bool_]) -> Array:
-    """Densities (k, s) per mm^2 with which a wrong pose has the spots of rods at distances off (k, s, 2) mm.
+def _near_miss_densities(spots_mm: Array, frame: Frame, cuts: Cuts, rods: NDArray[np.intp]) -> Array:
+    """Densities (k, s) per mm^2 with which a wrong pose has the spots of rods (k,) at (s, 2) mm.
 
     A few millimetres off, in any direction; or, where a tilt is wrong, anywhere along the way that a leaning rod's spot
     takes through the slice when the frame is moved.
     """
+    off = spots_mm - cuts.points_mm[rods][:, None]
     squared = (off**2).sum(axis=2)
     anywhere = (1.0 + squared / (2 * _NEAR_MISS_MM**2)) ** -2 / (2 * math.pi * _NEAR_MISS_MM**2)
     directions = cuts.directions[rods, :2]

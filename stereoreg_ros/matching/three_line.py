@@ -47,13 +47,13 @@ from stereoreg_ros.solvers.three_lines import ThreeLineSolver
 _CHUNK = 4000
 # Work after which a search is given up: some seconds. Only clutter takes so much. The unit is what a triple of spots
 # takes with six rods; so much more takes a start that is refined, with six rods and few spots, and the search of a
-# triple of rods by itself.
+# triple of rods by itself. From this share of it on, a search is not done once more.
 _MOST_WORK = 6_000_000
-_WORK_OF_START, _WORK_OF_SEARCH = 40, 100_000
+_WORK_OF_START, _WORK_OF_SEARCH, _LONG = 40, 100_000, 0.1
 _FEW_SPOTS = 30
 # An accepted explanation's spots are looked at from all triples of each set of four rods, as these have twins, and from
-# so many of each set of more.
-_FEWEST, _LOOKS_AT_FOUR, _LOOKS = 4, 4, 3
+# so many of each set of more. Where nothing was found, or nothing better, all spots are looked at from so many.
+_FEWEST, _LOOKS_AT_FOUR, _LOOKS, _LOOKS_AGAIN = 4, 4, 3, 2
 # From so many rods on, only of a frame of which any of so many typical slices has twins; these are poses of no more
 # than this chi-square, with spots known to so many mm or worse.
 _FEWEST_WITHOUT_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 32, 20.0, 0.25
@@ -107,9 +107,9 @@ def match(
             least_rods = level
         if found and (known or search.is_acceptable(found[0])):
             found = distinct([*found, *search.twins_of(found, looks_twice=not known)], gains)
-        elif least_rods == _FEWEST <= len(frame):
-            # One triple is all that a set of four rods has been tried by: no level below finds what it has missed.
-            found = distinct([*found, *search.second_look(_FEWEST, found)], gains)
+        elif least_rods <= len(frame):
+            # A set of rods is tried by one triple, whose spots may lie in a line: no level below finds what it missed.
+            found = distinct([*found, *search.second_look(least_rods, found)], gains)
             if found and search.is_acceptable(found[0]):
                 found = distinct([*found, *search.twins_of(found)], gains)
     except SearchGivenUpError:
@@ -131,11 +131,23 @@ def find_better(
     """An explanation within the prior that scores above `least_score`, and that chance brings less often than allowed.
 
     The one of the most rods, or None where there is none of `fewest` or more. least_score: see `consensus.score`;
-    allowed_log10: number of such explanations that chance may bring, each number of rods taken by itself. Raises
-    SearchGivenUpError where that would take too long to say.
+    allowed_log10: number of such explanations that chance may bring, each number of rods taken by itself. Where none is
+    found soon, further triples of rods are tried. Raises SearchGivenUpError where it would take too long to say.
     """
     gains = spots.gains(frame)
     search = _Search(spots, frame, prior, options)
+
+    def best_of(found: Iterator[Hypothesis], allowed: float) -> Hypothesis | None:
+        better = (
+            one
+            for one in distinct([*found], gains)
+            if score(one, gains) > least_score
+            and search.false_alarms(one) <= allowed
+            and one.chi_square <= chi2.isf(_IMPLAUSIBLE, 2 * one.inliers - 6)
+        )
+        return next(better, None)
+
+    tried = None
     for level in search.levels:
         # What matches of so many rods have to share with those of other numbers does not count here.
         allowed = allowed_log10 - math.log10(share_of(level, len(frame)))
@@ -148,16 +160,14 @@ def find_better(
             float(chi2.isf(_IMPLAUSIBLE, 2 * level - 6)),
             most_chi_square_of(level, decades_left),
         )
-        better = [
-            one
-            for one in distinct([*search.level(level, most_chi_square, [])], gains)
-            if score(one, gains) > least_score
-            and search.false_alarms(one) <= allowed
-            and one.chi_square <= chi2.isf(_IMPLAUSIBLE, 2 * one.inliers - 6)
-        ]
-        if better:
-            return better[0]
-    return None
+        best = best_of(search.level(level, most_chi_square, []), allowed)
+        if best is not None:
+            return best
+        tried = level, most_chi_square, allowed
+    if tried is None or search.is_long:
+        return None
+    level, most_chi_square, allowed = tried
+    return best_of(search.second_look(level, [], most_chi_square), allowed)
 
 
 def match_most(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> list[Hypothesis]:
@@ -189,6 +199,11 @@ class _Search:
         self._searched_down_to: dict[tuple[int, int, int], int] = {}
         self._log10_false_alarms: dict[Hypothesis, float] = {}
         self._work = 0.0
+
+    @property
+    def is_long(self) -> bool:
+        """Whether so much has been done that the like once more would take too long."""
+        return self._work > _LONG * _MOST_WORK
 
     @property
     def levels(self) -> range:
@@ -253,15 +268,19 @@ class _Search:
             if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
                 yield hypothesis
 
-    def second_look(self, level: int, known: list[Hypothesis]) -> Iterator[Hypothesis]:
+    def second_look(
+        self, level: int, known: list[Hypothesis], most_chi_square: float = math.inf, looks: int = _LOOKS_AGAIN
+    ) -> Iterator[Hypothesis]:
         """Explanations of so many rods, or more, besides the known, from further triples of rods than `level` tried."""
-        for starts in self._second_starts(level, known):
+        for starts in self._second_starts(level, known, most_chi_square, looks):
             yield from self._settled(starts)
 
-    def _second_starts(self, level: int, known: list[Hypothesis]) -> Iterator[Starts]:
-        looks = _LOOKS_AT_FOUR if level == _FEWEST else _LOOKS
+    def _second_starts(
+        self, level: int, known: list[Hypothesis], most_chi_square: float, looks: int
+    ) -> Iterator[Starts]:
+        looks = _LOOKS_AT_FOUR if level == _FEWEST else looks
         for lines in further_triples(self._frame, self._options.min_inliers, level, looks):
-            yield from self._starts_from_triple(lines, level, math.inf, known)
+            yield from self._starts_from_triple(lines, level, most_chi_square, known)
 
     def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
         """The same as `level`, but only from the spots of the best explanation known."""
@@ -280,9 +299,9 @@ class _Search:
         if rods < _FEWEST_WITHOUT_TWINS or (looks_twice and _has_twins(self._frame, rods, self._spots.sigma_mm)):
             search, here, rows = self._among_own(known)
             if search is self:
-                starts += self._second_starts(rods, here)
+                starts += self._second_starts(rods, here, math.inf, _LOOKS)
             else:
-                yield from self._renumbered(search.second_look(rods, here), rows)
+                yield from self._renumbered(search.second_look(rods, here, looks=_LOOKS), rows)
         # What all of them lead to costs little more than what one of them does.
         yield from self._settled(joined(starts))
 
