@@ -437,6 +437,17 @@ def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> 
             for lines in further_triples(frame, options.min_inliers, rods, _LOOKS):
                 _solver(frame, lines, _tolerance_mm(sigma_mm)).table(rods, most)
                 yield
+    # Where nothing is found, or nothing that contradicts it, all spots are looked at once more.
+    again = [
+        (lines, rods)
+        for rods in range(most, options.min_inliers - 1, -1)
+        for lines in further_triples(
+            frame, options.min_inliers, rods, _LOOKS_AT_FOUR if rods == _FEWEST else _LOOKS_AGAIN
+        )
+    ]
+    for lines, rods in again[: _SOLVERS // 2]:
+        _solver(frame, lines, _tolerance_mm(sigma_mm)).table(rods, most)
+        yield
     begun_at = most
     # Of frames of many rods only some: the rest is for spots that are known less well.
     for lines, complete_from in order[: _SOLVERS // 2]:
