@@ -87,7 +87,7 @@ class Row:
 
 
 def frame_named(name: str) -> Frame:
-    """A shipped frame, made as drawn, or `random12`: so many rods through a cube, no two of them parallel or close."""
+    """A shipped frame, manufactured exactly to its drawing; or, for `random12`, twelve random rods through a cube."""
     if not name.startswith("random"):
         frame = load_frame(name)
         return replace(frame, tolerances_mm=np.zeros(len(frame)))

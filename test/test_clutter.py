@@ -166,7 +166,7 @@ class TestLattices:
     def test_matched_spots_elsewhere_are_not_of_it(self) -> None:
         """Of a true frame over a template one spot in 17 lies on a hole by chance, as large as holes are taken to be.
 
-        The same holes are on finer lattices, too, 1.41, 2, 2.24 and 3 to the pitch, and any may be the fitted one.
+        The same holes are on finer lattices, too, 1.41, 2, 2.24 and 3 to the pitch; on these more spots would lie.
         """
         rng = np.random.default_rng(9)
         lattice = holes(13.0, 5.0, 13)
@@ -178,7 +178,7 @@ class TestLattices:
             on_holes += int((ratios(chosen, own) > 1.5 * ratios(chosen, own, in_order=False)).sum())
         share = 0.24**2
         print(f"{on_holes} of {6 * sets} raised")
-        assert on_holes <= 4 * share * 6 * sets
+        assert on_holes <= 2 * share * 6 * sets
 
     @pytest.mark.parametrize("seed", [1, 2])
     def test_among_uniform_ones(self, seed: int) -> None:
@@ -187,6 +187,12 @@ class TestLattices:
         chosen = lattice[rng.permutation(len(lattice))[:26]]
         found = ratios(np.concatenate([chosen[6:], uniform(rng, 10)]), chosen[:6])
         assert np.mean(found > 5) > 0.8
+
+    def test_a_row_of_spots_marks_none(self) -> None:
+        """An evenly spaced needle; the matched spots lie where a lattice of its pitch would have holes."""
+        needle = np.stack([10.0 * np.arange(14), np.full(14, 30.0)], axis=1)
+        own = np.array([[60.0, 90.0], [110.0, 90.0], [140.0, 130.0], [120.0, 170.0], [70.0, 160.0], [40.0, 120.0]])
+        np.testing.assert_allclose(ratios(needle, own), ratios(needle, own, in_order=False))
 
     def test_two_are_none(self) -> None:
         np.testing.assert_allclose(ratios(holes(10.0, 0.0, 13)[[4, 90]]), 1.0)

@@ -64,7 +64,10 @@ def lucky_chi_square(inliers: int) -> float:
 
 
 def most_chi_square_of(inliers: int, decades: float) -> float:
-    """Chi-square with which chance brings a match of so many rods so many decades more often than the luckiest."""
+    """The chi-square at which matches by chance are 10^decades times as frequent as at `lucky_chi_square`.
+
+    They grow as the power inliers - 3 of chi-square, see `log10_expected`.
+    """
     return lucky_chi_square(inliers) * float(10.0 ** (decades / (inliers - 3)))
 
 

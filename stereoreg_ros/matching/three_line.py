@@ -51,8 +51,8 @@ _CHUNK = 4000
 _MOST_WORK = 6_000_000
 _WORK_OF_START, _WORK_OF_SEARCH, _LONG = 40, 100_000, 0.1
 _FEW_SPOTS = 30
-# An accepted explanation's spots are looked at from all triples of each set of four rods, as these have twins, and from
-# so many of each set of more. Where nothing was found, or nothing better, all spots are looked at from so many.
+# How many triples of each set of rods a second look tries: all of a set of four, as four rods have twins; _LOOKS of a
+# larger one when looking for twins of an accepted explanation; _LOOKS_AGAIN when the first search found nothing.
 _FEWEST, _LOOKS_AT_FOUR, _LOOKS, _LOOKS_AGAIN = 4, 4, 3, 2
 # From so many rods on, only of a frame of which any of so many typical slices has twins; these are poses of no more
 # than this chi-square, with spots known to so many mm or worse.
@@ -81,7 +81,8 @@ def match(
     goes on as long as an explanation of fewer rods, if it fits well, could come near: among the spots of the best
     explanation, as twins of a pose share them, and among all spots where chance may bring one that could be accepted.
     What was found is looked at once more from further triples of rods, for twins that one triple may have missed: see
-    docs/matching.md for how many of the poses a triple of rods finds.
+    docs/matching.md for how many of the poses a triple of rods finds. Where nothing acceptable was found, further
+    triples are tried too: the spots of the first may lie in a line.
     """
     gains, apart = spots.gains(frame), decades_apart(options)
     search = _Search(spots, frame, prior, options)
@@ -278,8 +279,7 @@ class _Search:
     def _second_starts(
         self, level: int, known: list[Hypothesis], most_chi_square: float, looks: int
     ) -> Iterator[Starts]:
-        looks = _LOOKS_AT_FOUR if level == _FEWEST else looks
-        for lines in further_triples(self._frame, self._options.min_inliers, level, looks):
+        for lines in _further(self._frame, self._options, level, looks):
             yield from self._starts_from_triple(lines, level, most_chi_square, known)
 
     def level_of_twins(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
@@ -292,7 +292,8 @@ class _Search:
 
         The true pose may be the one that was missed, and what was found its twin: no level below would tell, as it
         seeks what comes near the best with fewer rods. looks_twice: whether further triples are tried of six rods or
-        more. Near a pose that was accepted before they have been, and one triple hardly ever misses a twin.
+        more. Near a guess they are not: the guess as a rule is a pose that was accepted after such a search, and one
+        triple of six rods rarely misses a twin.
         """
         starts = [starts_along_valley(known[0]), _starts_without_one(known[0])]
         rods = known[0].inliers
@@ -344,6 +345,11 @@ class _Search:
         return self._searched[lines]
 
 
+def _further(frame: Frame, options: RegistrationOptions, rods: int, looks: int) -> tuple[tuple[int, int, int], ...]:
+    """The triples of rods that a second look tries for sets of so many rods."""
+    return further_triples(frame, options.min_inliers, rods, _LOOKS_AT_FOUR if rods == _FEWEST else looks)
+
+
 def _starts_without_one(hypothesis: Hypothesis) -> Starts:
     """Starts at a pose with each of its rods left out in turn.
 
@@ -358,7 +364,7 @@ def _starts_without_one(hypothesis: Hypothesis) -> Starts:
 
 
 def _has_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:
-    """Whether so many spots of the frame, known to sigma_mm, have twins in some typical slice.
+    """Whether any of a sample of slices that show `rods` rods has a twin, with spots known to sigma_mm.
 
     The distances between k spots set 2k - 3 conditions to the six numbers of two slices that show the same: four spots
     have twins, and five near ones. From six on few slices have them, unless the frame is nearly symmetric.
@@ -434,16 +440,14 @@ def preparation(frame: Frame, sigma_mm: float, options: RegistrationOptions) -> 
     # Of slices with all rods or all but one, what was accepted is looked at once more.
     for rods in range(max(least, _FEWEST_WITHOUT_TWINS), most + 1):
         if _has_twins(frame, rods, sigma_mm):
-            for lines in further_triples(frame, options.min_inliers, rods, _LOOKS):
+            for lines in _further(frame, options, rods, _LOOKS):
                 _solver(frame, lines, _tolerance_mm(sigma_mm)).table(rods, most)
                 yield
     # Where nothing is found, or nothing that contradicts it, all spots are looked at once more.
     again = [
         (lines, rods)
         for rods in range(most, options.min_inliers - 1, -1)
-        for lines in further_triples(
-            frame, options.min_inliers, rods, _LOOKS_AT_FOUR if rods == _FEWEST else _LOOKS_AGAIN
-        )
+        for lines in _further(frame, options, rods, _LOOKS_AGAIN)
     ]
     for lines, rods in again[: _SOLVERS // 2]:
         _solver(frame, lines, _tolerance_mm(sigma_mm)).table(rods, most)
