@@ -100,8 +100,9 @@ demo: venv
 	@mkdir -p '$(dir $(DEMO_OUTPUT))'
 	$(WITH_ROS) $(EXECUTABLES)/demo_report --slices $(SLICES) --output '$(DEMO_OUTPUT)'
 
+# Two processes on two cores: threads of OpenBLAS would only get in each other's way.
 test: venv catphan debian
-	$(WITH_ROS) .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile)
+	$(WITH_ROS) OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile)
 
 # colcon test is content where no test ran.
 colcon-test: venv

@@ -56,5 +56,7 @@ def _start(context: LaunchContext) -> list[Node]:
             namespace=given("namespace"),
             parameters=parameters,
             output="screen",
+            # Matrices of six rods gain nothing from several threads of OpenBLAS, which would only wait for each other.
+            additional_env={"OPENBLAS_NUM_THREADS": "1"},
         )
     ]

@@ -13,7 +13,9 @@ from scipy.stats import chi2
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import rotation_angle
+from stereoreg_ros.matching.consensus import IMPLAUSIBLE
 from stereoreg_ros.matching.hypothesis import Found, Hypothesis
+from stereoreg_ros.matching.other_scale import OtherScale
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import PoseEstimate, Reason
@@ -24,8 +26,8 @@ DEGENERATE_ROTATION_DEG: Final = 10.0
 # Standard deviations beyond which a pose is accepted with a caution: four of them are 2 mm and 3 degrees.
 WEAK_POSITION_MM: Final = 0.5
 WEAK_ROTATION_DEG: Final = 0.75
-# Probabilities of a residual as large by the stated errors alone: less than these, and it is not they.
-_IMPLAUSIBLE, _DOUBTFUL = 0.01, 0.05
+# Probability of a residual as large by the stated errors alone from which it is doubtful; see IMPLAUSIBLE.
+_DOUBTFUL = 0.05
 # Of a scale that fits the spots so much better than the stated one.
 _SCALE_IMPLAUSIBLE = 5e-3
 # Log-likelihood by which unmatched spots beside rods that have none, and a poor fit, may speak for a mistake: one slice
@@ -86,7 +88,7 @@ def judge(
         return Verdict("no_consensus", f"the search among {spots} spots was {found.given_up}")
     if not estimates:
         return Verdict("no_consensus", _describe_nothing(found, len(frame), spots, options))
-    for check in (_by_chance, _residual, _several_poses, _near_misses):
+    for check in (_by_chance, _residual, _several_poses, _near_misses, _pieces):
         verdict = check(found, estimates, frame, spots, options)
         if verdict is not None:
             return verdict
@@ -101,6 +103,19 @@ def contradicted_orientation(best: Hypothesis, other: Hypothesis, prior: Prior, 
         f"{best.inliers} of {lines} rods match within {math.degrees(prior.max_rotation):g} degrees of "
         f"nominal_orientation, but {other.inliers}, and clearly better, with the frame at {angle_deg:.0f} degrees from "
         "it: check nominal_orientation, max_rotation_deg and how the patient or frame lies",
+    )
+
+
+def other_scale(best: Hypothesis, other: OtherScale | None, lines: int) -> Verdict | None:
+    """Refused where one rod more has its spot with another scale, and that is clearly likelier."""
+    if other is None or other.evidence <= _MOST_EVIDENCE:
+        return None
+    along_x, along_y = -100 * other.too_large
+    return Verdict(
+        "contradicted",
+        f"{best.inliers} of {lines} rods match with the stated pixel spacing, but {other.inliers}, and clearly better, "
+        f"with one changed by {along_x:+.1f} % along x and {along_y:+.1f} % along y: check pixel_spacing and the size "
+        "of the frame in its file",
     )
 
 
@@ -141,7 +156,7 @@ def _residual(
             f"chi-square falls by {misfit.fall:.0f} where the spacing is free; it was stated as known to "
             f"{100 * misfit.stated:.2g} %. Check pixel_spacing and the frame file",
         )
-    if _plausibility(best) < _IMPLAUSIBLE:
+    if _plausibility(best) < IMPLAUSIBLE:
         return Verdict(
             "inaccurate",
             f"the residual of {best.residual_rms_px:.2f} pixel RMS over {best.inliers} rods cannot come from "
@@ -189,6 +204,19 @@ def _near_misses(
         f"{best.inliers} of {len(frame)} rods are matched, but beside the places of others, which have no spot, there "
         f"are unmatched spots that would be theirs if something were slightly wrong{both}: check frame file, pixel "
         "spacing and nominal orientation",
+    )
+
+
+def _pieces(
+    found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
+) -> Verdict | None:
+    best = found.hypotheses[0]
+    if best.pieces <= _MOST_EVIDENCE:
+        return None
+    return Verdict(
+        "inaccurate",
+        f"{best.inliers} of {len(frame)} rods are matched, but unmatched spots crowd about theirs, as where spots have "
+        "fallen to pieces: the centre of such a spot is at none of its pieces; check threshold and min_spot_area_mm2",
     )
 
 

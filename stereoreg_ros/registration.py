@@ -26,12 +26,14 @@ from stereoreg_ros.judgement import (
     check_orientation,
     contradicted_orientation,
     judge,
+    other_scale,
     second_frame,
 )
 from stereoreg_ros.matching import maurin2009, three_line
 from stereoreg_ros.matching.consensus import decades_apart, score
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.near import match_near
+from stereoreg_ros.matching.other_scale import with_other_scale
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots, Streaks, whitening_of
 from stereoreg_ros.matching.three_line import SearchGivenUpError, find_better
@@ -246,6 +248,9 @@ def _rivals(
 
     is_near: whether it is where the frame was before; then another frame of the same kind may be elsewhere.
     """
+    verdict = other_scale(best, with_other_scale(best, spots, frame, prior), len(frame))
+    if verdict is not None:
+        return verdict
     try:
         if prior.max_rotation < math.pi:
             anywhere = replace(prior, max_rotation=math.pi)

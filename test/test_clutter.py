@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.matching.clutter import matched_densities
+from stereoreg_ros.matching.clutter import likeness_to_pieces, matched_densities
 
 SIDE_MM = 256.0
 AREA_MM2 = SIDE_MM**2
@@ -123,6 +123,28 @@ class TestClumps:
         np.testing.assert_allclose(ratios(np.concatenate([OWN[:2] + 1.0, far]))[2:], 1.0)
 
 
+class TestPieces:
+    @pytest.mark.parametrize("count", [1, 3, 12, 48])
+    def test_uniform_spots_hardly_ever_look_so(self, count: int) -> None:
+        """By more than a thousand to one at most once in a thousand, as a ratio of likelihoods has it."""
+        rng = np.random.default_rng(11)
+        drawn = (np.concatenate([OWN, uniform(rng, count)]) for _ in range(2000))
+        assert sum(likeness_to_pieces(spots, SIX, AREA_MM2) > math.log(1000.0) for spots in drawn) <= 4
+
+    @pytest.mark.parametrize("radius_mm", [0.5, 1.5, 3.0])
+    @pytest.mark.parametrize("false", [0, 12])
+    def test_pieces_do(self, radius_mm: float, false: int) -> None:
+        """One more piece of each spot is enough."""
+        rng = np.random.default_rng(12)
+        for _ in range(50):
+            pieces = OWN + rng.uniform(-radius_mm, radius_mm, OWN.shape)
+            spots = np.concatenate([OWN, pieces, uniform(rng, false)])
+            assert likeness_to_pieces(spots, SIX, AREA_MM2) > math.log(1000.0)
+
+    def test_no_others_look_like_nothing(self) -> None:
+        assert likeness_to_pieces(OWN, SIX, AREA_MM2) == 0.0
+
+
 # Of a needle's spots along it; none at the matched spot at 0.
 STEPS_MM = np.array([-41.3, -30.2, -22.8, -9.1, 12.6, 19.7, 34.9])
 
@@ -138,6 +160,14 @@ class TestLines:
         found, crowd = ratios(needle, own), ratios(needle, own, in_order=False)
         assert (found[[0, 3]] > 3 * crowd[[0, 3]]).all()
         np.testing.assert_allclose(np.delete(found, [0, 3]), np.delete(crowd, [0, 3]))
+
+    def test_a_row_ends_as_far_beyond_its_last_spot_as_its_spots_are_apart(self) -> None:
+        """On its line both matched spots are suspect, the one that may be the next of the row far more."""
+        along = (OWN[3] - OWN[0]) / np.linalg.norm(OWN[3] - OWN[0])
+        row = OWN[0] + (5.5 * np.arange(1, 6))[:, None] * along
+        assert np.linalg.norm(OWN[3] - OWN[0]) > 6 * 5.5 + 5.5 + 2, "beyond the row's end"
+        found = ratios(row)
+        assert found[0] > 5 * found[3] > 15
 
     def test_a_needle_beside_them_says_nothing_of_them(self) -> None:
         needle = np.column_stack([np.full(7, 20.0), 40.0 + STEPS_MM])

@@ -25,9 +25,12 @@ from stereoreg_ros.judgement import (
     check_orientation,
     contradicted_orientation,
     judge,
+    other_scale,
     second_frame,
 )
+from stereoreg_ros.matching.consensus import IMPLAUSIBLE
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.other_scale import OtherScale
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from stereoreg_ros.simulation import ScannerSettings, centred_pose, random_pose
@@ -53,10 +56,10 @@ def estimate(rods: int = 6, pose: Pose | None = None, first_spot: int = 0) -> Po
     return PoseEstimate(where, where, SURE, matches, 2.0 * rods - 6, -9.0, ScaleMisfit(1.0, 2, 0.002))
 
 
-def hypothesis(rods: int = 6, pose: Pose | None = None, near_misses: float = 0.0) -> Hypothesis:
+def hypothesis(rods: int = 6, pose: Pose | None = None, near_misses: float = 0.0, pieces: float = 0.0) -> Hypothesis:
     where = pose or Pose.identity()
     spot_of_line = np.where(np.arange(6) < rods, np.arange(6), UNMATCHED)
-    return Hypothesis(where.rotation, where.translation, spot_of_line, 1.0, np.eye(6), 0, near_misses)
+    return Hypothesis(where.rotation, where.translation, spot_of_line, 1.0, np.eye(6), 0, near_misses, pieces)
 
 
 def nothing_else() -> Verdict | None:
@@ -67,9 +70,10 @@ def judged(
     *estimates: PoseEstimate,
     options: RegistrationOptions = STANDING,
     near_misses: float = 0.0,
+    pieces: float = 0.0,
     rivals: Callable[[], Verdict | None] = nothing_else,
 ) -> Verdict:
-    found = Found([hypothesis(near_misses=near_misses), *[hypothesis() for _ in estimates[1:]]], 4)
+    found = Found([hypothesis(near_misses=near_misses, pieces=pieces), *[hypothesis() for _ in estimates[1:]]], 4)
     return judge(found, estimates, FRAME, SPOTS, options, rivals)
 
 
@@ -195,7 +199,7 @@ class TestResidual:
     @pytest.mark.parametrize("rods", [4, 6])
     def test_is_refused_and_doubted_by_its_probability(self, rods: int) -> None:
         freedom = 2 * rods - 6
-        refused, doubted = judgement._IMPLAUSIBLE, judgement._DOUBTFUL
+        refused, doubted = IMPLAUSIBLE, judgement._DOUBTFUL
         # A few of a thousand true slices at most are lost for it, and more are doubted.
         assert 1e-3 <= refused <= 0.02
         assert refused < doubted <= 0.1
@@ -334,6 +338,15 @@ class TestPrecision:
         assert f"target (100, 0, 0) mm of the frame are within {1.96 * math.radians(100):.2f} mm" in verdict.message
 
 
+@pytest.mark.parametrize(("pieces", "reason"), [(math.log(1001), "inaccurate"), (math.log(999), None)])
+def test_pieces(pieces: float, reason: str | None) -> None:
+    verdict = judged(estimate(), pieces=pieces)
+    assert verdict.reason == reason
+    if reason:
+        assert "unmatched spots crowd about theirs" in verdict.message
+        assert "check threshold and min_spot_area_mm2" in verdict.message
+
+
 class TestOrder:
     def test_rivals_are_sought_only_where_nothing_else_refuses(self) -> None:
         asked = []
@@ -373,6 +386,17 @@ class TestSentencesOfRivals:
         assert verdict.reason == "contradicted"
         assert "5 of 8 rods match within 30 degrees of nominal_orientation, but 6" in verdict.message
         assert "at 170 degrees" in verdict.message
+
+    def test_other_scale(self) -> None:
+        """Refused from a thousand to one."""
+        wrong = np.array([0.051, -0.004])
+        verdict = other_scale(hypothesis(5), OtherScale(6, wrong, math.log(1001)), 8)
+        assert verdict is not None
+        assert verdict.reason == "contradicted"
+        assert "5 of 8 rods match with the stated pixel spacing, but 6" in verdict.message
+        assert "changed by -5.1 % along x and +0.4 % along y: check pixel_spacing" in verdict.message
+        assert other_scale(hypothesis(5), OtherScale(6, wrong, math.log(999)), 8) is None
+        assert other_scale(hypothesis(5), None, 8) is None
 
     def test_second_frame(self) -> None:
         other = Pose(np.eye(3), np.array([30.0, 40.0, 0.0]))

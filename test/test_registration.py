@@ -17,6 +17,7 @@ from stereoreg_ros.geometry.pose import rotation_angle
 from stereoreg_ros.geometry.projection import cut, cut_jacobian, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.judgement import MAX_SPOTS
+from stereoreg_ros.matching.consensus import IMPLAUSIBLE
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, centred_pose, random_pose, random_spot_set
 
 SCANNER = ScannerSettings()
@@ -350,8 +351,8 @@ class TestPlausibility:
         """But for what is doubted or refused of the right noise itself."""
         found = self.outcomes(cube, 0.2)
         assert set(found) <= {"plain", "doubtful", "implausible"}
-        self.assert_share(found, "implausible", judgement._IMPLAUSIBLE)
-        self.assert_share(found, "doubtful", judgement._DOUBTFUL - judgement._IMPLAUSIBLE)
+        self.assert_share(found, "implausible", IMPLAUSIBLE)
+        self.assert_share(found, "doubtful", judgement._DOUBTFUL - IMPLAUSIBLE)
 
     def test_a_noise_told_too_large_is_no_reason_to_doubt(self, cube):
         assert set(self.outcomes(cube, 0.4)) == {"plain"}
@@ -359,7 +360,7 @@ class TestPlausibility:
     def test_a_noise_told_too_small_is_doubted_or_refused(self, cube):
         """Chi-square of 6 degrees of freedom is four times as large, so that more than half of all are refused."""
         found = self.outcomes(cube, 0.1)
-        levels = (judgement._DOUBTFUL, judgement._IMPLAUSIBLE)
+        levels = (judgement._DOUBTFUL, IMPLAUSIBLE)
         doubtful, implausible = (float(chi2.sf(chi2.isf(level, 6) / 4, 6)) for level in levels)
         assert implausible > 0.5
         self.assert_share(found, "plain", 1 - doubtful)

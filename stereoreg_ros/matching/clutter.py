@@ -24,6 +24,9 @@ _FEWEST: Final = 3
 # Radius about a matched spot within which fragments of the rod's spot lie, and half the width of a line, mm.
 _CLUMP_MM: Final = 6.0
 _HALF_LINE_MM: Final = 0.75
+# How far the pieces of a spot lie from each other, per axis.
+_PIECE_MM: Final = 2.0
+_PIECE_SHARES: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 # Pitches of a square lattice that are looked for, mm; a finer one is not told from none.
 _FINEST_MM, _COARSEST_MM = 2.5, 25.0
 # Steps of wave number, as phases over the spots' extent; how far, as a share of the pitch, a spot may be off a hole.
@@ -52,6 +55,21 @@ def matched_densities(spots_mm: Array, matched: NDArray[np.intp], area_mm2: floa
         for region in (_around_frame, _clumps, _lines, _lattice) if in_order else (_around_frame,):
             densities = np.maximum(densities, region(own, others, area_mm2))
     return densities
+
+
+def likeness_to_pieces(spots_mm: Array, matched: NDArray[np.intp], area_mm2: float) -> float:
+    """By how much (log-likelihood) unmatched spots look like pieces of the matched ones, over lying anywhere.
+
+    Some share of them are pieces, whichever, or none. A spot that has fallen to pieces has its centre at none of them.
+    Arguments: see `matched_densities`.
+    """
+    others = np.delete(spots_mm, matched, axis=0)
+    squared = ((others[:, None] - spots_mm[matched]) ** 2).sum(axis=2)
+    # Student's distribution of two degrees of freedom, in the plane.
+    beside = ((1.0 + squared / (2 * _PIECE_MM**2)) ** -2 / (2 * math.pi * _PIECE_MM**2)).mean(axis=1)
+    # Uniform over the area, whatever their number.
+    of_shares = np.log1p(_PIECE_SHARES[:, None] * (beside * area_mm2 - 1.0)).sum(axis=1)
+    return float(np.logaddexp.reduce(of_shares) - math.log(len(of_shares)))
 
 
 def _around_frame(own: Array, others: Array, area_mm2: float) -> Array:
@@ -87,19 +105,28 @@ def _lines(own: Array, others: Array, area_mm2: float) -> Array:
     first, along = first[apart], along[apart] / length[apart][:, None]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
 
-    def is_on(points: Array) -> NDArray[np.bool_]:
+    def off_lines(points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """How far along each line points (p, 2) lie, and whether they are on it: (p, lines) each."""
         off = points[:, None] - own[first]
-        return np.asarray(np.abs((off * across).sum(axis=2)) <= _HALF_LINE_MM)
+        return (off * along).sum(axis=2), np.abs((off * across).sum(axis=2)) <= _HALF_LINE_MM
 
-    count = is_on(others).sum(axis=0)
+    place, is_on = off_lines(others)
+    count = is_on.sum(axis=0)
     # As far as spots could lie.
     strip_mm2 = 2 * _HALF_LINE_MM * math.sqrt(area_mm2)
     expected = len(others) * strip_mm2 / area_mm2
     crowded = (count >= _FEWEST) & (gammainc(np.maximum(count, 1), expected) * len(count) < _CROWDED)
-    if crowded.any():
-        with_them = is_on(own)[:, crowded] * (count[crowded] / strip_mm2)
-        densities = with_them.max(axis=1)
-    return np.asarray(densities, dtype=np.float64)
+    if not crowded.any():
+        return densities
+    count, is_on, place = count[crowded], is_on[:, crowded], place[:, crowded]
+    # The row ends somewhere: as far beyond its last spots as these are apart, there may be one more.
+    low, high = np.where(is_on, place, np.inf).min(axis=0), np.where(is_on, place, -np.inf).max(axis=0)
+    apart_mm = (high - low) / (count - 1)
+    own_place, own_on = (part[:, crowded] for part in off_lines(own))
+    within = (own_place >= low - apart_mm - _HALF_LINE_MM) & (own_place <= high + apart_mm + _HALF_LINE_MM)
+    of_row = count / (2 * _HALF_LINE_MM * (high - low + 2 * apart_mm + 2 * _HALF_LINE_MM))
+    with_them = np.where(own_on, np.where(within, np.maximum(of_row, count / strip_mm2), count / strip_mm2), 0.0)
+    return np.asarray(with_them.max(axis=1), dtype=np.float64)
 
 
 def _lattice(own: Array, others: Array, area_mm2: float) -> Array:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
-from stereoreg_ros.matching.clutter import matched_densities
+from stereoreg_ros.matching.clutter import likeness_to_pieces, matched_densities
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.pose_volume import low_stretch, plane_sample, pose_volume, stretch
 from stereoreg_ros.matching.prior import Prior
@@ -29,6 +29,8 @@ from stereoreg_ros.options import RegistrationOptions
 
 # Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
 GATE = 18.4
+# Probability below which a chi-square is not by the stated errors.
+IMPLAUSIBLE = 0.01
 # Height in chi-square of the ridge between two optima below which they are one valley; and its largest extent, rad.
 _RIDGE = 4.0
 _LARGEST_VALLEY = 0.5
@@ -45,7 +47,7 @@ EVIDENCE_SLACK = 2.5
 # the plane, of this scale per axis, as most mistakes move it by a few millimetres and some by a centimetre.
 _NEAR_MISS_MM = 2.0
 # So near to a spot of another rod a rod without one may be taken for it.
-_SHARED_SPOT_MM = 5.0
+SHARED_SPOT_MM = 5.0
 # By how much, rad, a wrong pose turns the way that a leaning rod's spot takes.
 _WAY_TURNED = 0.2
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
@@ -86,7 +88,7 @@ def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
     best = np.full(len(frame), -np.inf)
     best[rods] = evidence.max(axis=1)
     apart = np.linalg.norm(cuts.points_mm[possible, None] - spots.mm[hypothesis.spot_of_line], axis=2)
-    shares = (apart <= _SHARED_SPOT_MM) & matched
+    shares = (apart <= SHARED_SPOT_MM) & matched
     best_of_possible = np.maximum(best[possible], np.where(shares, best, -np.inf).max(axis=1))
     # That the image reaches there, the spot shows; and two rods are seldom cut at one place.
     cost = MISSING_COST * (_well_within_ends(frame, cuts)[possible] | shares.any(axis=1))
@@ -217,20 +219,30 @@ def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, ap
     """
     if not found:
         return []
+    matched = found[0].spot_of_line[found[0].spot_of_line != UNMATCHED]
+    best = replace(
+        found[0],
+        log10_false_alarms=log10_false_alarms(found[0], spots, frame, prior),
+        near_misses=near_misses(found[0], spots, frame),
+        pieces=likeness_to_pieces(spots.mm, matched, area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)),
+    )
+    # A spot in line with false ones, or on a lattice of them, may well be one of them: it says less.
     gains = spots.gains(frame)
+    gains[matched] -= np.log(_densities(best, spots) / _densities(best, spots, in_order=False))
     rivals = [
         replace(one, log10_false_alarms=log10_false_alarms(one, spots, frame, prior, in_order=False))
-        for one in found
-        if evidence(found[0], gains) - evidence(one, gains) < apart * math.log(10)
+        for one in found[1:]
+        if evidence(best, gains) - evidence(one, gains) < apart * math.log(10)
     ]
-    most = rivals[0].log10_false_alarms + apart
-    rivals = [one for one in rivals if one.inliers >= rivals[0].inliers or one.log10_false_alarms <= most]
-    best = replace(
-        rivals[0],
-        log10_false_alarms=log10_false_alarms(rivals[0], spots, frame, prior),
-        near_misses=near_misses(rivals[0], spots, frame),
-    )
-    return [best, *rivals[1:]]
+    most = best.log10_false_alarms + apart
+    return [best, *(one for one in rivals if one.inliers >= best.inliers or one.log10_false_alarms <= most)]
+
+
+def _densities(hypothesis: Hypothesis, spots: Spots, in_order: bool = True) -> Array:
+    """Densities (k,) per mm^2 of false spots where the matched ones lie; see `clutter.matched_densities`."""
+    matched = hypothesis.spot_of_line[hypothesis.spot_of_line != UNMATCHED]
+    area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
+    return matched_densities(spots.mm, matched, area_mm2, in_order)
 
 
 def log10_false_alarms(
@@ -241,7 +253,6 @@ def log10_false_alarms(
     in_order: whether to look for order in the clutter too, which takes longer.
     """
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
-    matched = hypothesis.spot_of_line[lines]
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
     covariances = spots.match_covariances(frame, cuts, hypothesis.spot_of_line)[lines]
     whitening = whitening_of(covariances)
@@ -258,7 +269,7 @@ def log10_false_alarms(
     ratio = float(stretch(information, variance_mm2))
     area_mm2 = area_of_uniform_mm2(spots.mm, spots.slice_area_mm2)
     # Clutter that is denser where the matched spots lie is as if all were spread over less.
-    density = math.exp(float(np.log(matched_densities(spots.mm, matched, area_mm2, in_order)).mean()))
+    density = math.exp(float(np.log(_densities(hypothesis, spots, in_order)).mean()))
     dense_mm2 = len(spots.mm) / density
     volume = pose_volume(frame, len(lines), prior, min(area_mm2, dense_mm2))
     chance = Chance(len(spots.mm), dense_mm2, variance_mm2, ratio * volume)

@@ -21,7 +21,8 @@ class Hypothesis:
     rod the row of its spot, or UNMATCHED; chi_square: squared residuals over the noise; information (6, 6): inverse
     covariance of the pose (see `solvers.maximum_likelihood.Refined`); missing: number of rods that the slice must cut
     among the spots, and that have none; near_misses: by how much (log-likelihood) those of them that have an unmatched
-    spot close by speak against the explanation; log10_false_alarms: see `matching.significance`.
+    spot close by speak against the explanation; pieces: by how much (log-likelihood) the unmatched spots look like
+    pieces of the matched ones; log10_false_alarms: see `matching.significance`.
     """
 
     rotation: Array
@@ -31,6 +32,7 @@ class Hypothesis:
     information: Array
     missing: int
     near_misses: float = 0.0
+    pieces: float = 0.0
     log10_false_alarms: float = math.nan
 
     @property

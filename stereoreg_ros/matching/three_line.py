@@ -20,6 +20,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.consensus import (
     EVIDENCE_SLACK,
+    IMPLAUSIBLE,
     count_missing,
     decades_apart,
     distinct,
@@ -59,8 +60,6 @@ _FEWEST, _LOOKS_AT_FOUR, _LOOKS, _LOOKS_AGAIN = 4, 4, 3, 2
 _FEWEST_WITHOUT_TWINS, _TYPICAL_SLICES, _NEAR_TWIN, _LEAST_SIGMA_MM = 6, 32, 20.0, 0.25
 # Solvers that are kept, of a few megabytes each.
 _SOLVERS = 64
-# Probability below which a chi-square is not by the stated errors.
-_IMPLAUSIBLE = 0.01
 # Explanations that chance brings less often than this (log10) are not sought beside one that was found.
 _LOG10_RIVALS = -3.0
 
@@ -107,6 +106,9 @@ def match(
                 found = distinct([*found, *further(level, most_chi_square, found)], gains)
             least_rods = level
         if found and (known or search.is_acceptable(found[0])):
+            if found[0].missing and not search.is_long:
+                # What the missing rods lack, an explanation by other spots may have that one triple missed.
+                found = distinct([*found, *search.second_look(found[0].inliers, found)], gains)
             found = distinct([*found, *search.twins_of(found, looks_twice=not known)], gains)
         elif least_rods <= len(frame):
             # A set of rods is tried by one triple, whose spots may lie in a line: no level below finds what it missed.
@@ -144,7 +146,7 @@ def find_better(
             for one in distinct([*found], gains)
             if score(one, gains) > least_score
             and search.false_alarms(one) <= allowed
-            and one.chi_square <= chi2.isf(_IMPLAUSIBLE, 2 * one.inliers - 6)
+            and one.chi_square <= chi2.isf(IMPLAUSIBLE, 2 * one.inliers - 6)
         )
         return next(better, None)
 
@@ -158,7 +160,7 @@ def find_better(
         # What the stated errors cannot explain would not be accepted either, and speaks against nothing.
         most_chi_square = min(
             2 * (level * gains.max() - least_score),
-            float(chi2.isf(_IMPLAUSIBLE, 2 * level - 6)),
+            float(chi2.isf(IMPLAUSIBLE, 2 * level - 6)),
             most_chi_square_of(level, decades_left),
         )
         best = best_of(search.level(level, most_chi_square, []), allowed)

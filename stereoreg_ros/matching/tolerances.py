@@ -68,6 +68,10 @@ class Tolerances(NamedTuple):
         """Everything is as the frame file and the scale have it, in a slice without thickness."""
         return cls(np.zeros(len(frame)), np.zeros((0, 2, 2)), 0.0, 0.0)
 
+    def with_scale_known_to(self, share: float) -> Tolerances:
+        """The same, with the spacing along x and that along y known to this share of it (standard deviation)."""
+        return self._replace(stretches=share * np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]]))
+
     @property
     def scale_std(self) -> float:
         """Standard deviation of the scale, as a share of it, in the direction in which it is largest."""
