@@ -110,7 +110,7 @@ def match(
                 # What the missing rods lack, an explanation by other spots may have that one triple missed.
                 found = distinct([*found, *search.second_look(found[0].inliers, found)], gains)
             found = distinct([*found, *search.twins_of(found, looks_twice=not known)], gains)
-        elif least_rods <= len(frame):
+        elif least_rods <= len(frame) and not search.is_long:
             # A set of rods is tried by one triple, whose spots may lie in a line: no level below finds what it missed.
             found = distinct([*found, *search.second_look(least_rods, found)], gains)
             if found and search.is_acceptable(found[0]):
