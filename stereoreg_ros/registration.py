@@ -325,7 +325,9 @@ def _estimate(hypothesis: Hypothesis, is_best: bool, spots: Spots, frame: Frame,
     whitened = _whitened(slice_from_frame, cuts, lines, spots, rows, whitening, common, seen)
     covariance = _covariance(hypothesis.information)
     if is_best and _is_weak(covariance):
-        covariance = covariance_along_valley(frame, slice_from_frame, lines, spots.mm[rows], whitening, common)
+        along = covariance_along_valley(frame, slice_from_frame, lines, spots.mm[rows], whitening, common)
+        # The valley is that of these matches; what others have widened it by stays.
+        covariance = _larger(covariance, along) if hypothesis.is_widened else along
     return PoseEstimate(
         slice_from_frame=slice_from_frame,
         scanner_from_frame=seen.scanner_from_slice @ slice_from_frame,
@@ -374,6 +376,16 @@ def _whitened(
         is_scale,
         spots.tolerances.scale_std,
     )
+
+
+def _larger(one: Array, other: Array) -> Array:
+    """The least covariance (6, 6) that is in no direction smaller than either of two, in the axes of both."""
+    root = np.linalg.cholesky(other)
+    back = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(back @ one @ back.T)
+    whole = root @ vectors
+    larger: Array = (whole * np.maximum(values, 1.0)) @ whole.T
+    return larger
 
 
 def _is_weak(covariance: Array) -> bool:

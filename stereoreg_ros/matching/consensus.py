@@ -24,7 +24,7 @@ from stereoreg_ros.matching.significance import (
     share_of,
 )
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE, SURE_MM
+from stereoreg_ros.matching.visibility import may_show, must_show
 from stereoreg_ros.options import RegistrationOptions
 
 # Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
@@ -36,6 +36,8 @@ _RIDGE = 4.0
 _LARGEST_VALLEY = 0.5
 # Squared distance, in standard deviations, below which two optima are one.
 _SAME_OPTIMUM = 0.1
+# An explanation of less than this share of the likelihood widens no other.
+_LEAST_SHARE = 1e-3
 # So far behind the best one (log-likelihood) an explanation is forgotten.
 _FAR_BEHIND = 30.0
 # Explanations are never held to be told apart by less than this many decades of likelihood.
@@ -57,14 +59,8 @@ MISSING_COST = 3.0
 def count_missing(spots: Spots, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> NDArray[np.intp]:
     """Numbers (m,) of rods without a spot that the slice must cut, well within their ends and among the spots."""
     with np.errstate(invalid="ignore"):
-        must_show = _well_within_ends(frame, cuts) & spots.surround(cuts.points_mm)
-    return np.asarray((must_show & (spot_of_line == UNMATCHED)).sum(axis=-1))
-
-
-def _well_within_ends(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore"):
-        within = (cuts.lambdas >= frame.lambda_min + SURE_MM) & (cuts.lambdas <= frame.lambda_max - SURE_MM)
-    return np.asarray(within & (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE))
+        expected = must_show(frame, cuts) & spots.surround(cuts.points_mm)
+    return np.asarray((expected & (spot_of_line == UNMATCHED)).sum(axis=-1))
 
 
 def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
@@ -78,9 +74,7 @@ def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
     others = np.setdiff1d(np.arange(len(spots.mm)), hypothesis.spot_of_line)
     cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
     matched = hypothesis.spot_of_line != UNMATCHED
-    with np.errstate(invalid="ignore"):
-        possible = (cuts.lambdas >= frame.lambda_min - END_SLACK_MM) & (cuts.lambdas <= frame.lambda_max + END_SLACK_MM)
-        possible &= (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE) & ~matched
+    possible = may_show(frame, cuts) & ~matched
     if not possible.any() or not len(others):
         return 0.0
     rods = np.flatnonzero(possible | matched)
@@ -91,7 +85,7 @@ def near_misses(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> float:
     shares = (apart <= SHARED_SPOT_MM) & matched
     best_of_possible = np.maximum(best[possible], np.where(shares, best, -np.inf).max(axis=1))
     # That the image reaches there, the spot shows; and two rods are seldom cut at one place.
-    cost = MISSING_COST * (_well_within_ends(frame, cuts)[possible] | shares.any(axis=1))
+    cost = MISSING_COST * (must_show(frame, cuts)[possible] | shares.any(axis=1))
     return float(np.maximum(best_of_possible + cost, 0.0).sum())
 
 
@@ -140,7 +134,7 @@ def distinct(found: list[Hypothesis], gains: Array) -> list[Hypothesis]:
     """The explanations best first, without those that say the same as a better one; gains: see `Spots.gains`.
 
     Two optima of one flat valley are one explanation, whose covariance holds both: near a double root the tilt's sign
-    is not known, and the better optimum's own curvature does not say so.
+    is not known, and the better optimum's own curvature does not say so. The same goes for two matches of one pose.
     """
     scores = {id(hypothesis): score(hypothesis, gains) for hypothesis in found}
     found = sorted(found, key=lambda h: -scores[id(h)])
@@ -156,16 +150,18 @@ def distinct(found: list[Hypothesis], gains: Array) -> list[Hypothesis]:
             kept.append(hypothesis)
             optima.append([hypothesis])
         elif not _is_known(hypothesis, optima[row]):
-            other = kept[row]
-            kept[row] = _widened(other, differences[row], score(other, gains) - score(hypothesis, gains))
+            kept[row] = _widened(kept[row], hypothesis, differences[row], gains)
             optima[row].append(hypothesis)
     return kept
 
 
 def _is_known(hypothesis: Hypothesis, optima: list[Hypothesis]) -> bool:
     """Whether one of these optima is the same, but for where a search ended: within a fraction of its uncertainty."""
-    differences = _differences(hypothesis, optima)
-    squared = np.einsum("ki,kij,kj->k", differences, np.array([one.information for one in optima]), differences)
+    same = [one for one in optima if (one.spot_of_line == hypothesis.spot_of_line).all()]
+    if not same:
+        return False
+    differences = _differences(hypothesis, same)
+    squared = np.einsum("ki,kij,kj->k", differences, np.array([one.information for one in same]), differences)
     return bool((squared < _SAME_OPTIMUM).any())
 
 
@@ -190,13 +186,26 @@ def _row_of_same(differences: Array, hypothesis: Hypothesis, others: list[Hypoth
     return None
 
 
-def _widened(hypothesis: Hypothesis, difference: Array, behind: float) -> Hypothesis:
-    """The hypothesis with a covariance that holds another optimum too, less likely by `behind` (log)."""
-    share = 1.0 / (1.0 + np.exp(min(behind, 50.0)))
-    if share * float(difference @ hypothesis.information @ difference) < 1e-3:
+def _widened(hypothesis: Hypothesis, other: Hypothesis, difference: Array, gains: Array) -> Hypothesis:
+    """The hypothesis with a covariance that holds another optimum of its valley too, and the valley of other matches.
+
+    Two rods meet and one of them does not show: either may have the spot, and only with the one is the tilt known.
+    """
+    ahead = score(hypothesis, gains) - score(other, gains)
+    is_other = (other.spot_of_line != hypothesis.spot_of_line).any()
+    if is_other:
+        ahead = evidence(hypothesis, gains) - evidence(other, gains)
+    share = 1.0 / (1.0 + math.exp(min(ahead, 50.0)))
+    if share < _LEAST_SHARE:
         return hypothesis
-    covariance = np.linalg.pinv(hypothesis.information) + share * np.outer(difference, difference)
-    return replace(hypothesis, information=np.linalg.pinv(covariance))
+    spread = np.outer(difference, difference)
+    if not is_other and share * float(difference @ hypothesis.information @ difference) < 1e-3:
+        return hypothesis
+    covariance = np.linalg.pinv(hypothesis.information)
+    if is_other:
+        covariance += share * (np.linalg.pinv(other.information) - covariance)
+    information = np.linalg.pinv(np.asarray(covariance + share * spread, dtype=np.float64))
+    return replace(hypothesis, information=information, is_widened=True)
 
 
 def decades_apart(options: RegistrationOptions) -> float:

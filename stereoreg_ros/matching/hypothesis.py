@@ -22,7 +22,8 @@ class Hypothesis:
     covariance of the pose (see `solvers.maximum_likelihood.Refined`); missing: number of rods that the slice must cut
     among the spots, and that have none; near_misses: by how much (log-likelihood) those of them that have an unmatched
     spot close by speak against the explanation; pieces: by how much (log-likelihood) the unmatched spots look like
-    pieces of the matched ones; log10_false_alarms: see `matching.significance`.
+    pieces of the matched ones; is_widened: whether the information is less than these matches give, as others explain
+    the slice too; log10_false_alarms: see `matching.significance`.
     """
 
     rotation: Array
@@ -33,6 +34,7 @@ class Hypothesis:
     missing: int
     near_misses: float = 0.0
     pieces: float = 0.0
+    is_widened: bool = False
     log10_false_alarms: float = math.nan
 
     @property

@@ -20,7 +20,7 @@ from stereoreg_ros.matching.consensus import IMPLAUSIBLE, MISSING_COST, SHARED_S
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
+from stereoreg_ros.matching.visibility import may_show
 from stereoreg_ros.solvers.maximum_likelihood import refine
 
 # Standard deviation of a mistaken spacing along each axis, as a share of it, and the largest that is believed.
@@ -100,11 +100,9 @@ def _best_of(
         common = free.common(frame, cuts, spot_of_line, used)
         refined = refine(frame, rotations, translations, free.mm[spot_of_line], used, whitening, common=common)
         rotations, translations = refined.rotations, refined.translations
-    lambdas, cosine = refined.cuts.lambdas, np.abs(refined.cuts.directions[..., 2])
-    with np.errstate(invalid="ignore"):
-        shows = (lambdas >= frame.lambda_min - END_SLACK_MM) & (lambdas <= frame.lambda_max + END_SLACK_MM)
-        shows &= cosine >= LEAST_COSINE
-    fits = (shows | ~used).all(axis=1) & (refined.chi_square <= chi2.isf(IMPLAUSIBLE, 2 * used.sum(axis=1) - 6))
+    fits = (may_show(frame, refined.cuts) | ~used).all(axis=1) & (
+        refined.chi_square <= chi2.isf(IMPLAUSIBLE, 2 * used.sum(axis=1) - 6)
+    )
     fits &= prior.angles(rotations) <= prior.max_rotation
     rows = np.flatnonzero(fits & refined.converged)
     if not rows.size:

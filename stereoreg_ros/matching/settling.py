@@ -12,7 +12,7 @@ from stereoreg_ros.matching.consensus import GATE, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.seed_search import Starts
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
+from stereoreg_ros.matching.visibility import may_show
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
 _ROUNDS = 4
@@ -48,6 +48,19 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
         spot_of_line, origin = assigned[rows], origin[rows]
         refined = _refine(spots, frame, refined.rotations[rows], refined.translations[rows], spot_of_line, _STEPS)
     return settled
+
+
+def settle_as_matched(spots: Spots, frame: Frame, start: Starts) -> list[Hypothesis]:
+    """Explanations of these very matches: refined, but no rod is matched anew.
+
+    Where few matches leave the pose open, a rod without a spot takes that of another rod, however far off; what
+    `settle` comes to then is another explanation.
+    """
+    refined = _refine(spots, frame, start.rotations, start.translations, start.spot_of_line, _STEPS)
+    polished = _polished(spots, frame, refined, start.spot_of_line)
+    unmatched = start.spot_of_line == UNMATCHED
+    shown = (may_show(frame, refined.cuts) | unmatched).all(axis=1)
+    return [one for one, is_shown in zip(polished, shown, strict=True) if is_shown]
 
 
 def _polished(spots: Spots, frame: Frame, refined: Refined, spot_of_line: NDArray[np.intp]) -> list[Hypothesis]:
@@ -99,10 +112,7 @@ def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:
         offset_y = spots.mm[:, 1] - refined.cuts.points_mm[..., 1, None]
         squared = yy * offset_x**2 + xx * offset_y**2 - 2 * xy * offset_x * offset_y
         squared /= xx * yy - xy**2
-    in_slack = refined.cuts.lambdas >= frame.lambda_min - END_SLACK_MM
-    in_slack &= refined.cuts.lambdas <= frame.lambda_max + END_SLACK_MM
-    in_slack &= np.abs(refined.cuts.directions[..., 2]) >= LEAST_COSINE
-    possible = (in_slack & known)[..., None]
+    possible = (may_show(frame, refined.cuts) & known)[..., None]
     if spots.streaks is not None:
         possible = possible & spots.streaks.allow(frame, refined.cuts)
     squared = np.where(possible, squared, np.inf)

@@ -21,6 +21,8 @@ _LONG_MM, _LEAST_ALIGNED = 3.0, 0.8
 # Of a solid rod cut at an angle, the spot is an ellipse: its squared length, as `Streaks` has it, is that share of
 # (diameter * slope) squared. A tube that is bright in its wall only is longer by the square root of two.
 _OF_DIAMETER, _HOLLOW = 0.75, 2.0
+# So far beyond the outermost spots, along each axis, a slice goes on at least.
+_BESIDE_MM = 3.0
 # Length, as a share of the diameter, of a thick rod's spot that is not round, its axes a fifth apart.
 _UNEVEN = 0.55
 
@@ -138,6 +140,6 @@ class Spots(NamedTuple):
         return Spots.of(self.mm[rows], self.covariances_mm2[rows], self.slice_area_mm2, self.tolerances, streaks)
 
     def surround(self, points_mm: Array) -> NDArray[np.bool_]:
-        """Which points (..., 2) mm lie within the box around the spots: there a rod would have been seen."""
-        inside = (points_mm >= self.mm.min(axis=0)) & (points_mm <= self.mm.max(axis=0))
+        """Which points (..., 2) mm lie in the box around the spots or just beyond: there a rod would have been seen."""
+        inside = (points_mm >= self.mm.min(axis=0) - _BESIDE_MM) & (points_mm <= self.mm.max(axis=0) + _BESIDE_MM)
         return np.asarray(inside.all(axis=-1))

@@ -21,6 +21,7 @@ from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.matching.consensus import (
     EVIDENCE_SLACK,
     IMPLAUSIBLE,
+    SHARED_SPOT_MM,
     count_missing,
     decades_apart,
     distinct,
@@ -34,13 +35,13 @@ from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.pose_volume import plane_sample, typical_slices
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.seed_search import SeedSearch, Starts, joined, search_seeds
-from stereoreg_ros.matching.settling import settle
+from stereoreg_ros.matching.settling import settle, settle_as_matched
 from stereoreg_ros.matching.significance import most_chi_square_of, share_of
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.matching.triple_order import further_triples, triple_order
 from stereoreg_ros.matching.valley_starts import starts_along_valley
-from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
+from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE, may_show
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.three_lines import ThreeLineSolver
 
@@ -297,6 +298,10 @@ class _Search:
         more. Near a guess they are not: the guess as a rule is a pose that was accepted after such a search, and one
         triple of six rods rarely misses a twin.
         """
+        exchanged = _starts_with_spots_exchanged(known[0], self._spots, self._frame)
+        for one in settle_as_matched(self._spots, self._frame, exchanged):
+            if self._prior.angles(one.rotation) <= self._prior.max_rotation:
+                yield one
         starts = [starts_along_valley(known[0]), _starts_without_one(known[0])]
         rods = known[0].inliers
         if rods < _FEWEST_WITHOUT_TWINS or (looks_twice and _has_twins(self._frame, rods, self._spots.sigma_mm)):
@@ -363,6 +368,24 @@ def _starts_without_one(hypothesis: Hypothesis) -> Starts:
     rotations = np.tile(hypothesis.rotation, (len(lines), 1, 1))
     translations = np.tile(hypothesis.translation, (len(lines), 1))
     return Starts(rotations, translations, spot_of_line, np.arange(len(lines)))
+
+
+def _starts_with_spots_exchanged(hypothesis: Hypothesis, spots: Spots, frame: Frame) -> Starts:
+    """Starts at a pose with the spot of a rod given to another one, which has none and is cut beside it.
+
+    Where two rods meet and one of them does not show, nothing but the other matches says which one does.
+    """
+    cuts = cut(frame, hypothesis.rotation, hypothesis.translation)
+    without = np.flatnonzero((hypothesis.spot_of_line == UNMATCHED) & may_show(frame, cuts))
+    having = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
+    apart = np.linalg.norm(cuts.points_mm[without, None] - spots.mm[hypothesis.spot_of_line[having]], axis=2)
+    rows = np.argwhere(apart <= SHARED_SPOT_MM)
+    spot_of_line = np.tile(hypothesis.spot_of_line, (len(rows), 1))
+    for matches, (row, column) in zip(spot_of_line, rows, strict=True):
+        matches[without[row]], matches[having[column]] = matches[having[column]], UNMATCHED
+    rotations = np.tile(hypothesis.rotation, (len(rows), 1, 1))
+    translations = np.tile(hypothesis.translation, (len(rows), 1))
+    return Starts(rotations, translations, spot_of_line, np.arange(len(rows)))
 
 
 def _has_twins(frame: Frame, rods: int, sigma_mm: float) -> bool:

@@ -1,6 +1,14 @@
 """Which rods a slice may show."""
 
+from __future__ import annotations
+
 from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.projection import Cuts
 
 # A rod that leaves the slice at less than 11.5 degrees (sine 0.2) has a streak for a spot: neither sought nor counted.
 LEAST_COSINE: Final = 0.2
@@ -8,3 +16,17 @@ LEAST_COSINE: Final = 0.2
 END_SLACK_MM: Final = 1.0
 # A rod is surely cut only so far from its ends.
 SURE_MM: Final = 2.0
+
+
+def may_show(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
+    """Whether a slice may show each rod (..., n): between its ends or just beyond, and not along the rod."""
+    with np.errstate(invalid="ignore"):
+        may = (cuts.lambdas >= frame.lambda_min - END_SLACK_MM) & (cuts.lambdas <= frame.lambda_max + END_SLACK_MM)
+        return np.asarray(may & (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE))
+
+
+def must_show(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
+    """Whether a slice must show each rod (..., n) that is in view: well between its ends, and not along the rod."""
+    with np.errstate(invalid="ignore"):
+        must = (cuts.lambdas >= frame.lambda_min + SURE_MM) & (cuts.lambdas <= frame.lambda_max - SURE_MM)
+        return np.asarray(must & (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE))
