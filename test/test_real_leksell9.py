@@ -105,8 +105,10 @@ def test_without_prior_none_is_wrong(threshold):
 
 
 def test_of_two_rods_that_meet_the_one_that_shows_is_not_taken_for_the_other(slices, frame):
-    """At the frame's end a diagonal is 6 mm from an upright. Without its spot the tilt is open, and taking the upright's
-    for it makes one up, 2.5 degrees off and stated to a third of a degree."""
+    """At the frame's end a diagonal is 6 mm from an upright; without its spot the tilt is open.
+
+    With the upright's spot for it there is one, 2.5 degrees off and stated to a third of a degree.
+    """
     ends = [min(slices, key=height_mm), max(slices, key=height_mm)]
     options = RegistrationOptions(threshold=1000.0, max_rotation_deg=30.0)
     for ct_slice in ends:
