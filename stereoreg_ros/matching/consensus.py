@@ -187,24 +187,22 @@ def _row_of_same(differences: Array, hypothesis: Hypothesis, others: list[Hypoth
 
 
 def _widened(hypothesis: Hypothesis, other: Hypothesis, difference: Array, gains: Array) -> Hypothesis:
-    """The hypothesis with a covariance that holds another optimum of its valley too, and the valley of other matches.
+    """The hypothesis with a covariance that holds another optimum of its valley, or that of as many other matches.
 
     Two rods meet and one of them does not show: either may have the spot, and only with the one is the tilt known.
     """
-    ahead = score(hypothesis, gains) - score(other, gains)
-    is_other = (other.spot_of_line != hypothesis.spot_of_line).any()
-    if is_other:
-        ahead = evidence(hypothesis, gains) - evidence(other, gains)
-    share = 1.0 / (1.0 + math.exp(min(ahead, 50.0)))
+    of_others = other.inliers >= hypothesis.inliers and (other.spot_of_line != hypothesis.spot_of_line).any()
+    weight = evidence if of_others else score
+    share = 1.0 / (1.0 + math.exp(min(weight(hypothesis, gains) - weight(other, gains), 50.0)))
     if share < _LEAST_SHARE:
         return hypothesis
-    spread = np.outer(difference, difference)
-    if not is_other and share * float(difference @ hypothesis.information @ difference) < 1e-3:
-        return hypothesis
     covariance = np.linalg.pinv(hypothesis.information)
-    if is_other:
-        covariance += share * (np.linalg.pinv(other.information) - covariance)
-    information = np.linalg.pinv(np.asarray(covariance + share * spread, dtype=np.float64))
+    added = share * np.outer(difference, difference)
+    if of_others:
+        added += share * (np.linalg.pinv(other.information) - covariance)
+    elif float(difference @ hypothesis.information @ difference) * share < _LEAST_SHARE:
+        return hypothesis
+    information = np.linalg.pinv(np.asarray(covariance + added, dtype=np.float64))
     return replace(hypothesis, information=information, is_widened=True)
 
 

@@ -107,7 +107,7 @@ def match(
                 found = distinct([*found, *further(level, most_chi_square, found)], gains)
             least_rods = level
         if found and (known or search.is_acceptable(found[0])):
-            if found[0].missing and not search.is_long:
+            if found[0].missing and found[0].inliers < len(spots.mm) and not search.is_long:
                 # What the missing rods lack, an explanation by other spots may have that one triple missed.
                 found = distinct([*found, *search.second_look(found[0].inliers, found)], gains)
             found = distinct([*found, *search.twins_of(found, looks_twice=not known)], gains)
