@@ -114,7 +114,7 @@ def height_mm(ct_slice: Slice) -> float:
 
 
 def register_found(
-    found: FoundSpots, ct_slice: Slice, frame: Frame, options: RegistrationOptions
+    found: FoundSpots, ct_slice: Slice, frame: Frame, options: RegistrationOptions, previous: Pose | None = None
 ) -> Registration | Refusal:
     """As `register_slice` does with the spots that it finds, where options give no slice thickness."""
     scale = ct_slice.scale
@@ -125,6 +125,7 @@ def register_found(
         options,
         scanner_from_slice=ct_slice.scanner_from_slice,
         slice_area_mm2=ct_slice.hu.size * scale.sx * scale.sy,
+        previous=previous,
         covariances_px2=found.covariances_px2,
     )
 

@@ -26,7 +26,7 @@ DEGENERATE_ROTATION_DEG: Final = 10.0
 # Standard deviations beyond which a pose is accepted with a caution: four of them are 2 mm and 3 degrees.
 WEAK_POSITION_MM: Final = 0.5
 WEAK_ROTATION_DEG: Final = 0.75
-# Probability of a residual as large by the stated errors alone from which it is doubtful; see IMPLAUSIBLE.
+# A residual that the stated errors alone would exceed less often than this is doubtful; for refusal see IMPLAUSIBLE.
 _DOUBTFUL = 0.05
 # Of a scale that fits the spots so much better than the stated one.
 _SCALE_IMPLAUSIBLE = 5e-3

@@ -42,7 +42,7 @@ from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
 from stereoreg_ros.spots import FoundSpots, find_spots
-from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, in_scanner_axes
+from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, enclosing_covariance, in_scanner_axes
 
 _MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
 # An explanation that chance brings more often (log10) speaks against no other.
@@ -327,7 +327,7 @@ def _estimate(hypothesis: Hypothesis, is_best: bool, spots: Spots, frame: Frame,
     if is_best and _is_weak(covariance):
         along = covariance_along_valley(frame, slice_from_frame, lines, spots.mm[rows], whitening, common)
         # The valley is that of these matches; what others have widened it by stays.
-        covariance = _larger(covariance, along) if hypothesis.is_widened else along
+        covariance = enclosing_covariance(covariance, along) if hypothesis.is_widened else along
     return PoseEstimate(
         slice_from_frame=slice_from_frame,
         scanner_from_frame=seen.scanner_from_slice @ slice_from_frame,
@@ -376,16 +376,6 @@ def _whitened(
         is_scale,
         spots.tolerances.scale_std,
     )
-
-
-def _larger(one: Array, other: Array) -> Array:
-    """The least covariance (6, 6) that is in no direction smaller than either of two, in the axes of both."""
-    root = np.linalg.cholesky(other)
-    back = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(back @ one @ back.T)
-    whole = root @ vectors
-    larger: Array = (whole * np.maximum(values, 1.0)) @ whole.T
-    return larger
 
 
 def _is_weak(covariance: Array) -> bool:

@@ -38,6 +38,19 @@ def in_scanner_axes(covariance: Array, scanner_from_slice: Pose) -> Array:
     return turned
 
 
+def enclosing_covariance(one: Array, other: Array) -> Array:
+    """A covariance (n, n) that is in no direction smaller than either of two, positive definite ones.
+
+    In the axes in which both are diagonal it has the larger variance of each.
+    """
+    root = np.linalg.cholesky(other)
+    back = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(back @ one @ back.T)
+    axes = root @ vectors
+    larger: Array = (axes * np.maximum(values, 1.0)) @ axes.T
+    return larger
+
+
 def point_covariance(covariance: Array, scanner_from_frame: Pose, point_in_frame: Array) -> Array:
     """Covariance (3, 3) mm^2, in scanner axes, of where the pose puts a point (3,) mm of the frame.
 

@@ -106,16 +106,14 @@ def test_where_rods_meet_the_one_may_have_taken_the_spot_of_the_other() -> None:
 @pytest.mark.parametrize("name", ["cube6", "cube8", "zframe"])
 def test_a_missing_rod_and_false_spots_hardly_ever_look_so(name: str) -> None:
     frame = load_frame(name)
-    believed = tried = 0
+    believed = 0
     draw = partial(true_scene, missing=1, most_false=24)
     for seed in range(150):
         scene = draw(np.random.default_rng([3, seed]), frame, AROUND)
         spots = spots_of(scene)
         other = with_other_scale(explained(scene, spots, true_matches(scene)), spots, frame, PRIOR)
-        tried += 1
         believed += other is not None and other.evidence > SURE
     # Once in a thousand by the bound on it.
-    assert tried == 150
     assert believed <= 1
 
 

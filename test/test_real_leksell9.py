@@ -104,7 +104,8 @@ def test_without_prior_none_is_wrong(threshold):
     assert not figures.missed
 
 
-def test_of_two_rods_that_meet_the_one_that_shows_is_not_taken_for_the_other(slices, frame):
+@pytest.mark.parametrize("previous", [None, LEKSELL_POSE], ids=["no guess", "near the pose before"])
+def test_of_two_rods_that_meet_the_one_that_shows_is_not_taken_for_the_other(slices, frame, previous):
     """At the frame's end a diagonal is 6 mm from an upright; without its spot the tilt is open.
 
     With the upright's spot for it there is one, 2.5 degrees off and stated to a third of a degree.
@@ -114,7 +115,7 @@ def test_of_two_rods_that_meet_the_one_that_shows_is_not_taken_for_the_other(sli
     for ct_slice in ends:
         for name in frame.line_names:
             found = changed(find_spots(ct_slice, options), ct_slice, frame, Change((name,)), np.random.default_rng(0))
-            result = register_found(found, ct_slice, frame, options)
+            result = register_found(found, ct_slice, frame, options, previous)
             if result:
                 error = np.linalg.norm(result.scanner_from_frame @ LEKSELL_POINT_MM - LEKSELL_POSE @ LEKSELL_POINT_MM)
                 assert error < 2 * result.estimate.target_error_95_mm(tuple(LEKSELL_POINT_MM)), name

@@ -12,6 +12,7 @@ from stereoreg_ros.uncertainty import (
     ScaleMisfit,
     Whitened,
     checked_scale_covariance,
+    enclosing_covariance,
     error_ball_95,
     in_scanner_axes,
     point_covariance,
@@ -26,6 +27,24 @@ def random_covariance(rng: np.random.Generator, position: float, rotation: float
 
 def random_pose(rng: np.random.Generator) -> Pose:
     return Pose(rotation_exp(rng.normal(size=3)), rng.normal(0, 100, 3))
+
+
+class TestEnclosingCovariance:
+    def test_is_nowhere_smaller_than_either_and_no_larger_than_it_has_to_be(self) -> None:
+        rng = np.random.default_rng(9)
+        for _ in range(20):
+            one, other = random_covariance(rng, 2.0, 0.01), random_covariance(rng, 1.0, 0.02)
+            both = enclosing_covariance(one, other)
+            # In units in which the enclosing one is the identity.
+            back = np.linalg.inv(np.linalg.cholesky(both))
+            within = [np.linalg.eigvalsh(back @ inner @ back.T) for inner in (one, other)]
+            assert max(part.max() for part in within) == pytest.approx(1.0, abs=1e-6)
+            assert sum((part > 1 - 1e-6).sum() for part in within) == 6, "each axis touches one of the two"
+
+    def test_of_one_within_the_other_is_the_other(self) -> None:
+        large = random_covariance(np.random.default_rng(10), 1.0, 0.01)
+        np.testing.assert_allclose(enclosing_covariance(0.3 * large, large), large, rtol=1e-6)
+        np.testing.assert_allclose(enclosing_covariance(large, 0.3 * large), large, rtol=1e-6)
 
 
 class TestErrorBall:

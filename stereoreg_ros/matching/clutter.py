@@ -24,7 +24,7 @@ _FEWEST: Final = 3
 # Radius about a matched spot within which fragments of the rod's spot lie, and half the width of a line, mm.
 _CLUMP_MM: Final = 6.0
 _HALF_LINE_MM: Final = 0.75
-# How far the pieces of a spot lie from each other, per axis.
+# How far the pieces of a spot lie from each other, mm per axis; shares of the unmatched spots that may be pieces.
 _PIECE_MM: Final = 2.0
 _PIECE_SHARES: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 # Pitches of a square lattice that are looked for, mm; a finer one is not told from none.

@@ -61,4 +61,11 @@ def match_near(
     rows = np.sort(best.spot_of_line[matched])
     own = replace(best, spot_of_line=np.where(matched, np.searchsorted(rows, best.spot_of_line), UNMATCHED))
     twins = three_line.match(spots.only(rows), frame, prior, options, known=[own])
-    return None if twins.given_up or len(twins.hypotheses) != 1 else Found(found, best.inliers)
+    if twins.given_up or len(twins.hypotheses) != 1:
+        return None
+    (looked_at,) = twins.hypotheses
+    if (looked_at.spot_of_line != own.spot_of_line).any():
+        return None
+    # Other matches of the same pose have widened it.
+    widened = replace(best, information=looked_at.information, is_widened=looked_at.is_widened)
+    return Found([widened], best.inliers)

@@ -266,9 +266,12 @@ class _Search:
                 yield starts.take(slice(first, first + _CHUNK))
 
     def _settled(self, starts: Starts) -> Iterator[Hypothesis]:
-        if not len(starts.origin):
-            return
-        for hypothesis in settle(self._spots, self._frame, starts, self._options.min_inliers):
+        if len(starts.origin):
+            yield from self._allowed(settle(self._spots, self._frame, starts, self._options.min_inliers))
+
+    def _allowed(self, hypotheses: list[Hypothesis]) -> Iterator[Hypothesis]:
+        """Those within the prior."""
+        for hypothesis in hypotheses:
             if self._prior.angles(hypothesis.rotation) <= self._prior.max_rotation:
                 yield hypothesis
 
@@ -299,9 +302,7 @@ class _Search:
         triple of six rods rarely misses a twin.
         """
         exchanged = _starts_with_spots_exchanged(known[0], self._spots, self._frame)
-        for one in settle_as_matched(self._spots, self._frame, exchanged):
-            if self._prior.angles(one.rotation) <= self._prior.max_rotation:
-                yield one
+        yield from self._allowed(settle_as_matched(self._spots, self._frame, exchanged))
         starts = [starts_along_valley(known[0]), _starts_without_one(known[0])]
         rods = known[0].inliers
         if rods < _FEWEST_WITHOUT_TWINS or (looks_twice and _has_twins(self._frame, rods, self._spots.sigma_mm)):
@@ -353,7 +354,7 @@ class _Search:
 
 
 def _further(frame: Frame, options: RegistrationOptions, rods: int, looks: int) -> tuple[tuple[int, int, int], ...]:
-    """The triples of rods that a second look tries for sets of so many rods."""
+    """The additional rod triples to search when a slice showing `rods` rods is searched a second time."""
     return further_triples(frame, options.min_inliers, rods, _LOOKS_AT_FOUR if rods == _FEWEST else looks)
 
 
