@@ -16,8 +16,8 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
-from stereoreg_ros.registration import at_least, register_spots
-from stereoreg_ros.result import Refusal, Registration
+from stereoreg_ros.registration import at_least, recognise_spots, register_spots
+from stereoreg_ros.result import Recognition, Refusal, Registration
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import calibrate_linear, calibrate_newton_raphson
 from stereoreg_ros.solvers.joint_calibration import calibrate_jointly
@@ -62,6 +62,10 @@ class Sighting:
     pixels: int | None = None
     scanner_from_slice: Pose | None = None
     stated: PixelScale | None = None
+
+    def area_mm2(self, scale: PixelScale) -> float | None:
+        """Of the slice with this scale, mm/pixel; None where its size is not known."""
+        return self.pixels * scale.sx * scale.sy if self.pixels else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +151,8 @@ def calibrate(
             other = _explained(enough, frame, start, options, calibration)
             if isinstance(found, str) or (not isinstance(other, str) and other.rods > found.rods):
                 found = other
+            if not _left_out(enough, found):
+                break
     if isinstance(found, str):
         return CalibrationRefusal(f"calibration refused: {found}")
     return _judged(found, scale, calibration)
@@ -243,9 +249,19 @@ def match_sighting(
     """Register the frame from the spots of a slice with this scale, mm/pixel, however weakly its pose is known."""
     # Which spot is which rod is all that is asked.
     options = replace(options, max_position_std_mm=_ANY_MM, max_target_error_mm=_ANY_MM)
-    area_mm2 = sighting.pixels * scale.sx * scale.sy if sighting.pixels else None
     plane, covariances = sighting.scanner_from_slice, sighting.covariances_px2
+    area_mm2 = sighting.area_mm2(scale)
     return register_spots(sighting.spots_px, frame, scale, options, plane, area_mm2, covariances_px2=covariances)
+
+
+def _recognised(
+    sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
+) -> Recognition | None:
+    """What the spots of a slice look most like with this scale, where that says something of the scale."""
+    plane, covariances = sighting.scanner_from_slice, sighting.covariances_px2
+    area_mm2 = sighting.area_mm2(scale)
+    seen = recognise_spots(sighting.spots_px, frame, scale, options, plane, area_mm2, covariances)
+    return None if seen is None or len(seen.matches) < MIN_LINES or _degenerate(frame, [seen]) else seen
 
 
 def _rich(matched: Sequence[tuple[Sighting, Registration]]) -> list[tuple[Sighting, Registration]]:
@@ -297,8 +313,8 @@ def _search(
         for sighting in list(waiting):
             if progress is not None and not progress(number / len(factors)):
                 yield None
-            seen = match_sighting(sighting, frame, start, loose)
-            if not seen or len(seen.matches) < MIN_LINES or _degenerate(frame, [seen]):
+            seen = _recognised(sighting, frame, start, loose)
+            if seen is None:
                 continue
             measured = _joint(frame, [seen], with_shear=False).scale
             if match_sighting(sighting, frame, measured, strict):
@@ -321,7 +337,7 @@ def _factors(max_change: float) -> list[tuple[float, float]]:
     return [(1 + x, 1 + y) for x, y in sorted(both, key=lambda pair: (max(map(abs, pair)), sum(map(abs, pair)), pair))]
 
 
-def _joint(frame: Frame, matched: Sequence[Registration], with_shear: bool) -> TolerantScale:
+def _joint(frame: Frame, matched: Sequence[Registration | Recognition], with_shear: bool) -> TolerantScale:
     """The scale from slices whose rods are known, from the Newton-Raphson solution of one (Maurin 2009, section 3)."""
     richest = max(matched, key=lambda one: len(one.matches))
     first = calibrate_newton_raphson(frame, *_couples(richest))
@@ -344,7 +360,9 @@ def _joint(frame: Frame, matched: Sequence[Registration], with_shear: bool) -> T
     )
 
 
-def _posed(frame: Frame, matched: Sequence[Registration]) -> tuple[Array, Array, Array, NDArray[np.bool_], Array]:
+def _posed(
+    frame: Frame, matched: Sequence[Registration | Recognition]
+) -> tuple[Array, Array, Array, NDArray[np.bool_], Array]:
     """Rotations, translations, the spot of each rod (m, n, 2), whether it has one, and the spots' covariances."""
     m, n = len(matched), len(frame)
     spots_px, covariances = np.zeros((m, n, 2)), np.tile(np.eye(2), (m, n, 1, 1))
@@ -360,18 +378,20 @@ def _posed(frame: Frame, matched: Sequence[Registration]) -> tuple[Array, Array,
     return rotations, translations, spots_px, used, covariances
 
 
-def _couples(registration: Registration) -> tuple[NDArray[np.intp], Array]:
+def _couples(registration: Registration | Recognition) -> tuple[NDArray[np.intp], Array]:
     """The rods (k,) that were identified, and their spots (k, 2) in pixel."""
     lines = np.array([match.line_index for match in registration.matches])
     return lines, np.array([match.spot_px for match in registration.matches])
 
 
-def _covariances(result: Registration | Refusal) -> Array:
-    known = result.covariances_px2
-    return np.zeros((len(result.spots_px), 2, 2)) if known is None else known
+def _covariances(result: Registration | Recognition | Refusal) -> Array:
+    if result.covariances_px2 is not None:
+        return result.covariances_px2
+    assert not isinstance(result, Recognition)  # which has them
+    return np.zeros((len(result.spots_px), 2, 2))
 
 
-def _degenerate(frame: Frame, matched: Sequence[Registration]) -> str:
+def _degenerate(frame: Frame, matched: Sequence[Registration | Recognition]) -> str:
     """Why no slice by itself fixes the scale (Maurin 2009, section 3.1); empty where one does."""
     reason = ""
     for one in matched:

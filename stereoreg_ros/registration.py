@@ -39,7 +39,7 @@ from stereoreg_ros.matching.spots import Spots, Streaks, whitening_of
 from stereoreg_ros.matching.three_line import SearchGivenUpError, find_better
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.options import RegistrationOptions
-from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
+from stereoreg_ros.result import Match, PoseEstimate, Recognition, Refusal, Registration
 from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
 from stereoreg_ros.spots import FoundSpots, find_spots
 from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, enclosing_covariance, in_scanner_axes
@@ -185,8 +185,44 @@ def register_spots(
     the scale was measured: what it makes the pose uncertain by is added to the pose's covariance.
     Raises ValueError where the spots are not of shape (n, 2) or not finite, or a covariance is none.
     """
+    seen = _given(spots_px, scale, scanner_from_slice, slice_area_mm2, covariances_px2, scale_covariance)
+    return _register(seen, frame, options or RegistrationOptions(), previous)
+
+
+def recognise_spots(
+    spots_px: ArrayLike,
+    frame: Frame,
+    scale: PixelScale,
+    options: RegistrationOptions | None = None,
+    scanner_from_slice: Pose | None = None,
+    slice_area_mm2: float | None = None,
+    covariances_px2: ArrayLike | None = None,
+) -> Recognition | None:
+    """What the spots look most like, the most rods before the best fit, or None where they look like no part of it.
+
+    It is not judged, and nothing is sought that speaks against it: a pose for those who test it in another way, as the
+    calibration does with scales. Arguments and errors: see `register_spots`.
+    """
     options = options or RegistrationOptions()
-    scanner_from_slice = scanner_from_slice or Pose.identity()
+    seen = _given(spots_px, scale, scanner_from_slice, slice_area_mm2, covariances_px2, None)
+    if check_orientation(frame, options) or check_count(len(seen.spots_px), options):
+        return None
+    spots, prior = _sought(seen, frame, options)
+    found = three_line.match_most(spots, frame, prior, options)
+    if not found:
+        return None
+    return Recognition(scale, options, _estimate(found[0], False, spots, frame, seen), seen.covariances_px2)
+
+
+def _given(
+    spots_px: ArrayLike,
+    scale: PixelScale,
+    scanner_from_slice: Pose | None,
+    slice_area_mm2: float | None,
+    covariances_px2: ArrayLike | None,
+    scale_covariance: ArrayLike | None,
+) -> _Seen:
+    """Spots that somebody else has found, checked; see `register_spots`."""
     spots_px = np.asarray(spots_px, dtype=np.float64)
     if spots_px.size == 0:
         spots_px = spots_px.reshape(0, 2)
@@ -196,8 +232,17 @@ def register_spots(
         raise ValueError("spots_px must be finite")
     covariances_px2 = _checked(covariances_px2, len(spots_px))
     known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    seen = _Seen(spots_px, covariances_px2, None, scale, scanner_from_slice, slice_area_mm2, known)
-    return _register(seen, frame, options, previous)
+    return _Seen(spots_px, covariances_px2, None, scale, scanner_from_slice or Pose.identity(), slice_area_mm2, known)
+
+
+def _sought(seen: _Seen, frame: Frame, options: RegistrationOptions) -> tuple[Spots, Prior]:
+    """The spots in mm with their errors, and the rotations allowed, as the matchers want them."""
+    scale = seen.scale
+    covariances_mm2 = scale.matrix @ at_least(seen.covariances_px2, options.spot_noise_px) @ scale.matrix.T
+    tolerances = _tolerances(frame, scale, options, seen.scale_covariance)
+    spots = Spots.of(scale.to_mm(seen.spots_px), covariances_mm2, seen.area_mm2, tolerances, seen.streaks)
+    nominal = seen.scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
+    return spots, Prior(nominal, math.radians(options.max_rotation_deg))
 
 
 def _register(seen: _Seen, frame: Frame, options: RegistrationOptions, previous: Pose | None) -> Registration | Refusal:
@@ -212,12 +257,7 @@ def _register(seen: _Seen, frame: Frame, options: RegistrationOptions, previous:
     unfit = check_orientation(frame, options) or check_count(len(seen.spots_px), options)
     if unfit is not None:
         return refusal(unfit)
-    scale = seen.scale
-    covariances_mm2 = scale.matrix @ at_least(seen.covariances_px2, options.spot_noise_px) @ scale.matrix.T
-    tolerances = _tolerances(frame, scale, options, seen.scale_covariance)
-    spots = Spots.of(scale.to_mm(seen.spots_px), covariances_mm2, seen.area_mm2, tolerances, seen.streaks)
-    nominal = seen.scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
-    prior = Prior(nominal, math.radians(options.max_rotation_deg))
+    spots, prior = _sought(seen, frame, options)
     allowed, found = options, None
     if previous is not None and options.matcher == "three_line":
         # Each of the two searches gets half of the false alarms that are allowed.
@@ -238,7 +278,7 @@ def _register(seen: _Seen, frame: Frame, options: RegistrationOptions, previous:
     )
     if verdict.reason is not None:
         return refusal(verdict, estimates)
-    return Registration(frame, scale, options, seen.spots_px, estimates[0], verdict.message, seen.covariances_px2)
+    return Registration(frame, seen.scale, options, seen.spots_px, estimates[0], verdict.message, seen.covariances_px2)
 
 
 def _rivals(

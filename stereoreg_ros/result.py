@@ -153,6 +153,24 @@ class Registration:
 
 
 @dataclass(frozen=True, eq=False)
+class Recognition:
+    """What the spots of a slice look most like, which nobody has judged: it may well be wrong.
+
+    For those who go on to test it in another way; fields as in `Registration`.
+    """
+
+    scale: PixelScale
+    options: RegistrationOptions
+    estimate: PoseEstimate
+    covariances_px2: Array
+
+    @property
+    def matches(self) -> tuple[Match, ...]:
+        """Which spot is which rod."""
+        return self.estimate.matches
+
+
+@dataclass(frozen=True, eq=False)
 class Refusal:
     """A slice without a pose that may be believed. False as a condition.
 

@@ -196,7 +196,7 @@ def test_poses_come_over_the_network_and_a_console_is_served(system):
     with RosClient("console") as console:
         assert console.set_parameters("register_node", max_pose_age=7.5).successful
         assert console.get_parameters("register_node", "max_pose_age") == [7.5]
-        response = console.call(Trigger, "register_node/recalibrate", deadline_s=60.0, again_after_s=None)
+        response = console.call(Trigger, "register_node/recalibrate", deadline_s=90.0, again_after_s=None)
         assert response.success, response.message
         measured = console.get_parameters("register_node", "pixel_spacing")[0]
         np.testing.assert_allclose(measured, [SCALE.sx, SCALE.sy], rtol=3e-3)

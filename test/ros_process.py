@@ -11,6 +11,8 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from filecmp import cmp
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,22 +43,31 @@ T = TypeVar("T")
 def command_of(executable: str) -> list[str]:
     """How `ros2 run` would start an executable: from the install folder here, or from a sourced workspace.
 
-    Where nothing is built, or it was built for another Python, the module of this source tree runs instead.
+    Where nothing is built, or it was built for another Python or before the source tree was last changed, the module of
+    this source tree runs instead.
     """
     place = Path("lib") / PACKAGE / executable
-    installed = REPOSITORY / "install" / PACKAGE / place
-    if installed.is_file() and _python_of(installed).parent == Path(sys.executable).parent:
+    prefix = REPOSITORY / "install" / PACKAGE
+    installed = prefix / place
+    if installed.is_file() and _python_of(installed).parent == Path(sys.executable).parent and _is_up_to_date(prefix):
         source = 'source "$1" && shift && exec "$@"'
         return ["bash", "-c", source, "bash", str(REPOSITORY / "install" / "setup.bash"), str(installed)]
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if prefix and (Path(prefix) / place).is_file():
-            return [str(Path(prefix) / place)]
+    for sourced in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if sourced and (Path(sourced) / place).is_file():
+            return [str(Path(sourced) / place)]
     return [sys.executable, "-m", f"{PACKAGE}.nodes.{executable}"]
 
 
 def _python_of(script: Path) -> Path:
     """The Python that a script's first line names."""
     return Path(script.read_text().splitlines()[0].removeprefix("#!"))
+
+
+def _is_up_to_date(prefix: Path) -> bool:
+    """Whether what is installed there has been made of the source tree as it is."""
+    sources = sorted((REPOSITORY / PACKAGE).rglob("*.py"))
+    copies = sorted(prefix.glob(f"lib/python*/site-packages/{PACKAGE}/**/*.py"))
+    return len(copies) == len(sources) and all(map(partial(cmp, shallow=False), sources, copies))
 
 
 class NodeProcess:

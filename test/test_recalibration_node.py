@@ -84,7 +84,7 @@ def test_from_a_wrong_spacing(client, factors):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES:
             bench.status(bench.send(image_of(hu)))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
         assert response.success, response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
         np.testing.assert_allclose(measured, [SCALE.sx, SCALE.sy], rtol=3e-3)
@@ -103,7 +103,7 @@ def test_spacing_that_came_with_the_slices_is_not_made_to_fit_the_frame(client):
         forget_slices(bench)
         for seed in range(4):
             bench.status(bench.send_spaced(of_a_larger_frame(seed), SCALE))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
         assert not response.success
         assert "scanner, or frame file?" in response.message
         assert "came with the slices is (0.5000, 0.6000) mm/pixel, the one measured is (0.48" in response.message
@@ -113,7 +113,7 @@ def test_spacing_that_came_with_the_slices_is_not_made_to_fit_the_frame(client):
 
         # On purpose it may be changed; the slices are still there.
         assert bench.set(calibration_max_change=0.15) == ""
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
         assert response.success, response.message
         assert "cannot be told apart" in response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
@@ -128,7 +128,7 @@ def test_spacing_that_was_typed_in_is(client):
         forget_slices(bench)
         for seed in range(4):
             bench.status(bench.send(image_of(of_a_larger_frame(seed))))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
         assert response.success, response.message
         assert "cannot be told apart" in response.message
         assert re.search(r"would have to be (2\.[5-9]|3\.[0-5]) % larger than its file says", response.message)
@@ -169,7 +169,7 @@ def test_slices_are_registered_meanwhile_and_a_second_call_is_refused(client):
         for other, _ in SLICES[1:4]:
             bench.accept(image_of(other))
         # What has come meanwhile is enough.
-        client.wait_for(first.done, "the answer", deadline_s=60.0)
+        client.wait_for(first.done, "the answer", deadline_s=90.0)
         assert first.result().success, first.result().message
         client.node.destroy_client(service)
 
@@ -201,7 +201,7 @@ def test_the_measured_spacing_outlives_the_node(client, tmp_path: Path):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES:
             bench.status(bench.send(image_of(hu)))
-        response = client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None)
+        response = client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
         assert response.success, response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
         process.stop(signal.SIGKILL)
@@ -238,7 +238,7 @@ def test_a_file_of_another_spacing_is_refused(client, tmp_path: Path):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES[:3]:
             bench.status(bench.send(image_of(hu)))
-        assert client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=60.0, again_after_s=None).success
+        assert client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None).success
     other = arguments("/other", (1.3 * SCALE.sx, SCALE.sy), f"calibration_file:={path}")
     with node_process("register_node", *other) as process:
         bench = Bench(client, "/other", "/other/image")

@@ -18,6 +18,7 @@ from stereoreg_ros.geometry.projection import cut, cut_jacobian, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.judgement import MAX_SPOTS
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE
+from stereoreg_ros.registration import recognise_spots
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, centred_pose, random_pose, random_spot_set
 
 SCANNER = ScannerSettings()
@@ -380,6 +381,36 @@ class TestPlausibility:
             assert estimate.degrees_of_freedom == 6
             values.append(estimate.chi_square)
         assert kstest(values, chi2(6).cdf).pvalue > 0.001
+
+
+class TestRecognition:
+    """What spots look most like, for those who test it in another way."""
+
+    def test_of_a_slice_that_is_accepted_it_is_the_same_pose(self, cube):
+        rng = np.random.default_rng(41)
+        for _ in range(8):
+            spots = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 9, 0.3, gaussian=True)).spots_px
+            accepted, recognised = register_spots(spots, cube, SCALE), recognise_spots(spots, cube, SCALE)
+            assert accepted
+            assert recognised is not None
+            pairs = [[(match.line, match.spot) for match in one.matches] for one in (accepted, recognised)]
+            assert pairs[0] == pairs[1]
+            found, expected = recognised.estimate.scanner_from_frame, accepted.scanner_from_frame
+            np.testing.assert_allclose(found.translation, expected.translation, atol=1e-3)
+
+    def test_what_would_be_refused_is_recognised_all_the_same(self, cube):
+        rng = np.random.default_rng(42)
+        spots = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 9, 0.3, gaussian=True)).spots_px
+        strict = RegistrationOptions(max_target_error_mm=0.01)
+        refused, recognised = register_spots(spots, cube, SCALE, strict), recognise_spots(spots, cube, SCALE, strict)
+        assert not refused
+        assert refused.reason == "inaccurate"
+        assert recognised is not None
+        assert len(recognised.matches) == 6
+
+    def test_nothing_where_nothing_looks_like_the_frame(self, cube):
+        assert recognise_spots(np.zeros((0, 2)), cube, SCALE) is None
+        assert recognise_spots([[10.0, 10.0], [60.0, 10.0], [300.0, 300.0], [310.0, 20.0]], cube, SCALE) is None
 
 
 class TestScaleCovariance:
