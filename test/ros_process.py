@@ -156,6 +156,14 @@ def node_process(
         process.close()
 
 
+@contextmanager
+def making_nodes() -> Iterator[None]:
+    """The first node of a process imports a parser of interface files that needs a module which Python is to lose."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
+        yield
+
+
 class RosClient:
     """A ROS node in this process, with a context of its own, that sends, receives and calls."""
 
@@ -163,9 +171,7 @@ class RosClient:
         os.environ.update(ROS_ENVIRONMENT)
         self._context = Context()
         rclpy.init(context=self._context)
-        with warnings.catch_warnings():
-            # The first node imports a parser of interface files that needs a module which Python is to lose.
-            warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
+        with making_nodes():
             self.node = Node(
                 name, context=self._context, namespace=namespace, enable_rosout=False, start_parameter_services=False
             )

@@ -54,7 +54,7 @@ def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
     rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not there")
     from rclpy.parameter import Parameter
     from rclpy.signals import SignalHandlerOptions
-    from ros_process import ROS_ENVIRONMENT
+    from ros_process import ROS_ENVIRONMENT, making_nodes
 
     from stereoreg_ros.nodes import register_node
 
@@ -63,7 +63,8 @@ def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
     os.environ.update(ROS_ENVIRONMENT)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = register_node.RegisterNode()
+        with making_nodes():
+            node = register_node.RegisterNode()
         scale = SCANNER.scale
         node.set_parameters([Parameter("pixel_spacing", value=[scale.sx, scale.sy])])
         few = three_line._solver.cache_info().currsize
