@@ -17,6 +17,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not there")
 HOSTS_APART = Path(__file__).with_name("hosts_apart.py")
 
 
+@pytest.mark.timeout(450)
 def test_hosts_apart() -> None:
     names = re.findall(r"^def (test_\w+)", HOSTS_APART.read_text(encoding="utf-8"), re.MULTILINE)
     command = [sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(HOSTS_APART)]
