@@ -82,14 +82,27 @@ class PlacedBench(Bench):
         self.client.publish(f"{self.namespace}/slice_pose", plane)
         self.send(image_of(hu), stamp=stamp)
 
+    def accept_any(self) -> None:
+        hu, _ = rendered(1)
+        stamp = self.next_stamp()
+        self.send_placed(hu, 0.0, stamp)
+        self.pose(stamp)
+
 
 @pytest.fixture(scope="module")
-def placed(client):
+def running(client):
     told = ["--ros-args", "-r", "__ns:=/placed", "-p", f"pixel_spacing:=[{SCALE.sx},{SCALE.sy}]"]
     with node_process("register_node", *told):
         bench = PlacedBench(client, "/placed", "/placed/image")
         bench.warm_up()
         yield bench
+
+
+@pytest.fixture
+def placed(running: PlacedBench) -> PlacedBench:
+    """The running node as at its start, whatever other tests have made of it."""
+    running.start_anew()
+    return running
 
 
 def test_slices_out_of_order_and_repeated(placed):

@@ -122,19 +122,33 @@ def test_one_frame_to_two_and_back(streams):
     hu, slice_from_frame = rendered(21)
     assert streams.set(frame_files=["cube6", "leksell_ct"]) == ""
     several = streams.client.collect(PoseStamped, f"{streams.namespace}/cube6/pose")
-    stamp = streams.send(image_of(hu))
-    streams.client.wait_for(lambda: of_stamp(several, stamp), "the pose of a frame among two")
+
+    def came() -> bool:
+        # Until both sides have discovered the new topic, its poses go astray.
+        stamp = streams.send(image_of(hu))
+        streams.client.wait_for(lambda: of_stamp(streams.diagnostics, stamp), "the diagnostics of an image")
+        return bool(several)
+
+    streams.client.wait_for(came, "the pose of a frame among two")
+    assert_near(conversions.pose_from_message(several[-1]), slice_from_frame)
     assert streams.set(frame_files=[]) == ""
     pose, _ = streams.accept(image_of(hu))
     assert_near(pose, slice_from_frame)
 
 
 @pytest.fixture(scope="module")
-def streams():
+def running():
     with RosClient("streams") as client, node_process("register_node", *arguments("/streams")):
         bench = Bench(client, "/streams", "/streams/image")
         bench.warm_up()
         yield bench
+
+
+@pytest.fixture
+def streams(running: Bench) -> Bench:
+    """The running node as at its start, whatever other tests have made of it."""
+    running.start_anew()
+    return running
 
 
 def test_target_error_and_age(streams):
@@ -173,16 +187,17 @@ def test_target_on_a_pose_that_will_not_do(streams, settings, reason):
         end = time.monotonic() + 0.2
         streams.client.wait_for(lambda: time.monotonic() > end, "the pose to age")
     assert streams.set(**settings) == ""
-    streams.targets.clear()
-    streams.diagnostics.clear()
     streams.client.publish(f"{streams.namespace}/target", target_of([1.0, 2.0, 3.0]))
     (status,) = streams.client.wait_for(
         lambda: statuses(streams.diagnostics, "register_node: target")[:1], "the target's status"
     )
     assert status.level == DiagnosticStatus.ERROR
     assert values_of(status)["reason"] == reason
-    assert not streams.targets
+    # The first that is published is that of the next pose, with which it will do.
     assert streams.set(**restored) == ""
+    stamp = streams.send(image_of(hu))
+    streams.client.wait_for(lambda: streams.targets, "target_in_frame")
+    assert [target.header.stamp for target in streams.targets] == [stamp]
 
 
 def test_latest_pose_waits_for_who_comes_late(streams):
@@ -275,7 +290,6 @@ def test_stream_that_stops_is_told_as_stale(streams):
     with_latency = [values_of(one) for one in statuses(streams.diagnostics, "register_node: stream")]
     known = [float(one["latency_ms"]) for one in with_latency if one["latency_ms"] != "nan"]
     assert all(0 < latency < 20_000 for latency in known)
-    assert streams.set(stale_after=10.0) == ""
 
 
 def test_required_slice_pose(client):
@@ -375,11 +389,11 @@ def test_markers_show_error_and_target(streams):
 
     def with_target() -> list[Marker]:
         streams.accept(image_of(hu))
-        targets = [marker for array in shown[-1:] for marker in array.markers if marker.ns == "target"]
-        # Until the target has come, which may be after a slice, the one of another test is shown.
-        return [one for one in targets if np.allclose([one.pose.position.x, one.pose.position.z], [0.005, 0.007])]
+        # The target may come after a slice, and there is none before it.
+        return [marker for array in shown[-1:] for marker in array.markers if marker.ns == "target"]
 
-    streams.client.wait_for(with_target, "a marker of the target")
+    position = streams.client.wait_for(with_target, "a marker of the target")[0].pose.position
+    np.testing.assert_allclose([position.x, position.y, position.z], [0.005, 0.006, 0.007])
     (ellipsoid,) = (m for m in shown[-1].markers if m.type == Marker.SPHERE and m.ns == "stereotactic_frame")
     assert 0 < ellipsoid.scale.x <= ellipsoid.scale.z < 0.01
 
