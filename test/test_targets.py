@@ -101,7 +101,7 @@ def test_without_a_pose_there_is_no_target(target):
     outcome = answer(target, None)
     assert isinstance(outcome, TargetRefusal)
     assert outcome.reason == "no_pose"
-    assert outcome.message == "the last slice was not registered, there is no pose to rest on"
+    assert outcome.message.startswith("there is no pose to rest on: the last slice was refused, or none has come since")
     assert math.isnan(outcome.pose_age_s)
 
 
@@ -258,6 +258,25 @@ def test_a_pose_of_another_spacing_is_none_to_rest_on(bench, change):
     last = bench.send(image_of(rendered(2)[0]))
     bench.client.wait_for(lambda: of_stamp(bench.targets, last), "target_in_frame")
     assert [one.header.stamp for one in bench.targets] == [first, last]
+
+
+def test_a_recalibration_ends_the_pose_before_and_so_does_the_way_back(bench):
+    """It was of a pixel spacing that is known to be wrong since."""
+    assert bench.set(pixel_spacing=[1.01 * SCALE.sx, 0.99 * SCALE.sy], calibration_timeout=0.0) == ""
+    image = image_of(rendered(12, noise_hu=5.0)[0])
+    assert bench.reach([1.0, 2.0, 3.0]) == [("cube6", "no_pose")]
+    first = bench.send(image)
+    bench.wait_told(2)
+    response = bench.call("recalibrate")
+    assert response.success, response.message
+    assert bench.reach([1.0, 2.0, 3.0]) == [("cube6", "no_pose")]
+    second = bench.send(image)
+    bench.wait_told(4)
+    assert bench.call("reset_calibration").success
+    assert bench.reach([1.0, 2.0, 3.0]) == [("cube6", "no_pose")]
+    last = bench.send(image)
+    bench.client.wait_for(lambda: of_stamp(bench.targets, last), "target_in_frame")
+    assert [one.header.stamp for one in bench.targets] == [first, second, last]
 
 
 FAULTY = {

@@ -226,8 +226,7 @@ class RegisterNode(Node):
 
     def _refuse_unusable(self, reason: Reason, message: str, header: Header, started: float) -> None:
         self.get_logger().warning(f"image refused: {message}", throttle_duration_sec=_REPEAT_WARNING_S)
-        for output in self._outputs:
-            output.latest = None
+        self._forget_poses()
         statuses = self._unusable(reason, message, header.frame_id, time.perf_counter() - started)
         self._publish_statuses(statuses, header)
         self._count(header)
@@ -406,16 +405,24 @@ class RegisterNode(Node):
             self._frame_fault = ""
             self._use_frames()
             self._forget_slices()
-        if names & {"pixel_spacing", "pixel_shear"} and self._scale.told(scale_before):
-            self._forget_slices()
+        if names & {"pixel_spacing", "pixel_shear"}:
+            if self._scale.told(scale_before):
+                self._forget_slices()
+            elif self.settings.scale != scale_before:
+                # It was measured from slices that are there, which say the same as before; a pose of theirs does not.
+                self._forget_poses()
         if names & _OF_THE_TABLES:
             self._prepare()
 
     def _forget_slices(self) -> None:
         """A slice seen under another frame or scale says nothing about this one."""
+        self._forget_poses()
+        self._scale.sightings.clear()
+
+    def _forget_poses(self) -> None:
+        """No target may rest any more on the poses so far."""
         for output in self._outputs:
             output.latest = None
-        self._scale.sightings.clear()
 
 
 # What the matcher's tables depend on.

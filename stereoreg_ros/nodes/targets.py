@@ -60,7 +60,11 @@ def target_in_frame(
 ) -> TargetInFrame | TargetRefusal:
     """Where the target, in scanner axes, is in the frame, by the frame's latest pose; now_s: of the steady clock."""
     if latest is None:
-        return TargetRefusal("no_pose", "the last slice was not registered, there is no pose to rest on")
+        return TargetRefusal(
+            "no_pose",
+            "there is no pose to rest on: the last slice was refused, or none has come since the start or since the "
+            "frame or the pixel spacing was changed",
+        )
     age_s = now_s - latest.received_s
     header, registration = latest.header, latest.registration
     try:
