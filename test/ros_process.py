@@ -25,6 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = "stereoreg_ros"
@@ -38,6 +39,7 @@ ROS_ENVIRONMENT = {
 }
 
 T = TypeVar("T")
+NodeType = TypeVar("NodeType", bound=Node)
 
 
 def command_of(executable: str) -> list[str]:
@@ -157,11 +159,25 @@ def node_process(
 
 
 @contextmanager
-def making_nodes() -> Iterator[None]:
+def _making_nodes() -> Iterator[None]:
     """The first node of a process imports a parser of interface files that needs a module which Python is to lose."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
         yield
+
+
+@contextmanager
+def node_here(make: Callable[[], NodeType]) -> Iterator[NodeType]:
+    """A node in this process, to be looked into."""
+    os.environ.update(ROS_ENVIRONMENT)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with _making_nodes():
+            node = make()
+        yield node
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
 
 
 class RosClient:
@@ -171,7 +187,7 @@ class RosClient:
         os.environ.update(ROS_ENVIRONMENT)
         self._context = Context()
         rclpy.init(context=self._context)
-        with making_nodes():
+        with _making_nodes():
             self.node = Node(
                 name, context=self._context, namespace=namespace, enable_rosout=False, start_parameter_services=False
             )

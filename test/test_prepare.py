@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 
@@ -48,23 +46,16 @@ def test_once_prepared_no_slice_waits_for_a_table(no_tables, monkeypatch, noise_
     assert_no_slice_waits_for_a_table(monkeypatch, FRAME, options)
 
 
-# The first node imports a parser of interface files that needs a module which Python is to lose.
-@pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
     rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not there")
     from rclpy.parameter import Parameter
-    from rclpy.signals import SignalHandlerOptions
-    from ros_process import ROS_ENVIRONMENT, making_nodes
+    from ros_process import node_here
 
     from stereoreg_ros.nodes import register_node
 
     monkeypatch.setattr(register_node, "_PREPARE_S", 0.0)
     monkeypatch.setattr(register_node, "_SPARE_TIME_S", 0.01)
-    os.environ.update(ROS_ENVIRONMENT)
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with making_nodes():
-            node = register_node.RegisterNode()
+    with node_here(register_node.RegisterNode) as node:
         scale = SCANNER.scale
         node.set_parameters([Parameter("pixel_spacing", value=[scale.sx, scale.sy])])
         few = three_line._solver.cache_info().currsize
@@ -72,9 +63,6 @@ def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
             if node._spare_time.is_canceled():
                 break
             rclpy.spin_once(node, timeout_sec=0.1)
-        node.destroy_node()
-    finally:
-        rclpy.shutdown()
     assert few < three_line._solver.cache_info().currsize
     # Tables are of one frame, as it was loaded.
     assert node.frame is not None

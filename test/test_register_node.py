@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import time
 from collections.abc import Iterator
@@ -12,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
 from builtin_interfaces.msg import Time
 from contract import DIAGNOSTIC_KEYS
@@ -22,8 +20,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
-from ros_process import DEADLINE_S, REPOSITORY, ROS_ENVIRONMENT, NodeProcess, RosClient, making_nodes, node_process
+from ros_process import DEADLINE_S, REPOSITORY, NodeProcess, RosClient, node_here, node_process
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
@@ -722,17 +719,10 @@ def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
 
     monkeypatch.setattr(register_node, "register_frames", broken)
     published: list[DiagnosticStatus] = []
-    os.environ.update(ROS_ENVIRONMENT)
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with making_nodes():
-            node = register_node.RegisterNode()
+    with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_publish_statuses", lambda statuses, _header: published.extend(statuses))
         node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
         node._on_image(image_of(rendered(19)[0]), {"received_timestamp": time.time_ns()})
-        node.destroy_node()
-    finally:
-        rclpy.shutdown()
     (status,) = published
     assert values_of(status)["reason"] == "bad_image"
     assert status.message == "internal error: RuntimeError: out of luck"

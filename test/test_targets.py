@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,15 +14,16 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped
-from ros_process import RosClient, node_process
+from rclpy.parameter import Parameter
+from ros_process import RosClient, node_here, node_process
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from test_register_node import CUBE, SCALE, SCANNER, Bench, image_of, of_stamp, rendered, target_of, values_of
 
 from stereoreg_ros import Pose, load_frame
-from stereoreg_ros.nodes import conversions
+from stereoreg_ros.nodes import conversions, register_node
 from stereoreg_ros.nodes.targets import Accepted, TargetInFrame, TargetRefusal, status_of_target, target_in_frame
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import PoseEstimate, Registration
@@ -301,6 +304,21 @@ def test_a_faulty_target_ends_the_one_before_and_is_forgotten(bench, faulty):
     # None with the second pose, neither of the good target nor of the faulty one.
     assert [reason for ((_, reason),) in bench.told()] == ["", "bad_target", ""]
     assert [one.header.stamp for one in bench.targets] == [first, last]
+
+
+def test_a_skipped_slice_leaves_the_pose_before(monkeypatch):
+    """It says nothing of the frame, and the next slice is waiting."""
+    told: list[DiagnosticArray] = []
+    monkeypatch.setattr(register_node, "_PREPARE_S", 0.0)
+    with node_here(register_node.RegisterNode) as node:
+        monkeypatch.setattr(node, "_diagnostics", SimpleNamespace(publish=told.append))
+        node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
+        image = image_of(rendered(2)[0])
+        image.header.frame_id = "ct"
+        node._on_image(image, {"received_timestamp": time.time_ns()})
+        node._skip(image)
+        node._on_target(target_of([1.0, 2.0, 3.0]))
+    assert [values_of(status)["reason"] for array in told for status in array.status] == ["", "skipped", ""]
 
 
 # cube6 on the left and cube8 on the right.
