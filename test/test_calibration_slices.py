@@ -176,3 +176,12 @@ class TestStrictness:
         for limit, accepted in ((high + math.log10(49) - 0.4, False), (high + math.log10(49) + 0.4, True)):
             found = calibrate([seen(spots)], cube, told, replace(OPTIONS, max_log10_false_alarms=limit))
             assert isinstance(found, Calibration) == accepted, found.message
+
+    def test_scales_are_tried_about_the_one_in_use_along_each_axis(self, cube: Frame) -> None:
+        """Columns and rows so unlike that no scale tried has them the other way round, or equal."""
+        true = PixelScale(0.4, 0.7)
+        told = PixelScale(1.08 * true.sx, 0.93 * true.sy)
+        spots = off_by(np.random.default_rng(10), cube, 2, 0.1, true)
+        found = calibrate([seen(one) for one in spots], cube, told, OPTIONS)
+        assert isinstance(found, Calibration), found.message
+        np.testing.assert_allclose([found.scale.sx, found.scale.sy], [true.sx, true.sy], rtol=0.01)
