@@ -138,7 +138,28 @@ class TestSpots:
         (along,) = streaks.along_mm
         along = along * np.sign(along @ lean[:2])
         np.testing.assert_allclose(along, thickness_mm * lean[:2], atol=0.1 * thickness_mm)
+        np.testing.assert_allclose(found.centres_px, [[220.0, 90.0]], atol=0.02)
         assert streaks.thickness_mm == thickness_mm
+
+    @pytest.mark.parametrize("turn_deg", [20.0, 100.0, 160.0])
+    def test_the_centre_of_a_streak_is_less_sure_along_it(self, turn_deg: float) -> None:
+        """A long spot in noise, aslant: its covariance lies as it does itself."""
+        turn = math.radians(turn_deg)
+        along = np.array([math.cos(turn), math.sin(turn)])
+        v, u = np.indices(SHAPE)
+        off = np.stack([u - 230.3, v - 80.6], axis=-1)
+        far, aside = off @ along, off @ [-along[1], along[0]]
+        image = 40.0 + 3000.0 * np.exp(-((far / 4.0) ** 2 + (aside / 1.2) ** 2) / 2)
+        image += 60.0 * np.random.default_rng(8).standard_normal(SHAPE)
+        found = find_spots(Slice(image.astype(np.float32), SCALE), RegistrationOptions(threshold=1000.0))
+        assert len(found) == 1
+        variances, axes = np.linalg.eigh(found.covariances_px2[0])
+        assert abs(axes[:, 1] @ along) > math.cos(math.radians(6.0))
+        # For noise alone a Gaussian's centre is known in proportion to its width.
+        assert math.sqrt(variances[1] / variances[0]) == pytest.approx(4.0 / 1.2, rel=0.25)
+        moments, axes = np.linalg.eigh(found.extents_px2[0])
+        assert abs(axes[:, 1] @ along) > math.cos(math.radians(3.0))
+        assert math.sqrt(moments[1] / moments[0]) == pytest.approx(4.0 / 1.2, rel=0.1)
 
     def test_the_length_of_a_uniform_streak_follows_from_its_moments(self) -> None:
         """A twelfth of the squared length, and as much along as across what the spot is wide."""
