@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from stereoreg_ros.calibration import Calibration, CalibrationRefusal, Sighting, calibrate, match_sighting, sighting_of
 from stereoreg_ros.calibration_series import scale_of_series
@@ -185,3 +186,64 @@ class TestStrictness:
         found = calibrate([seen(one) for one in spots], cube, told, OPTIONS)
         assert isinstance(found, Calibration), found.message
         np.testing.assert_allclose([found.scale.sx, found.scale.sy], [true.sx, true.sy], rtol=0.01)
+
+
+def without(line: int, spots_px: Array) -> Array:
+    """The spots of all rods but one, the last first."""
+    return np.delete(spots_px, line, axis=0)[::-1]
+
+
+class TestResiduals:
+    def test_are_those_of_poses_fitted_to_either_scale(self, cube: Frame) -> None:
+        """By scipy, slice by slice, over the rods that show: five in each."""
+        told = PixelScale(1.01 * TRUE.sx, 0.99 * TRUE.sy)
+        spots = [without(k, one) for k, one in enumerate(off_by(np.random.default_rng(11), cube, 3, 0.2))]
+        found = calibrate([seen(one) for one in spots], cube, told, EXACT_FRAME)
+        assert isinstance(found, Calibration), found.message
+        assert (found.slices, found.rods) == (3, 15)
+        for scale, stated in ((told, found.residual_before_px), (found.scale, found.residual_after_px)):
+            squares = 0.0
+            for missing, (one, pose) in enumerate(zip(spots, found.poses, strict=True)):
+
+                def residuals(
+                    step: Array, missing: int = missing, one: Array = one, pose: Pose = pose, scale: PixelScale = scale
+                ) -> Array:
+                    predicted = project(cube, pose.perturbed(step[:3], step[3:]), scale)[0]
+                    return (without(missing, predicted) - one).ravel()
+
+                squares += 2 * float(least_squares(residuals, np.zeros(6), xtol=1e-12).cost)
+            assert stated == pytest.approx(math.sqrt(squares / 15), rel=1e-4)
+        assert found.residual_before_px > 1.2 * found.residual_after_px
+
+
+class TestEachSliceAlone:
+    def test_is_measured_with_the_rods_that_show_and_as_sure_as_they_make_it(self, cube: Frame) -> None:
+        rng = np.random.default_rng(12)
+        poses = [random_pose(rng, cube, SCANNER, max_offset_mm=10.0) for _ in range(2)]
+        hidden = (cube.line_names[1], cube.line_names[4])
+        slices = [
+            (f"{pose_number}.dcm", render_slice([PlacedFrame(cube, pose, (name,))], SCANNER, rng))
+            for pose_number, (pose, name) in enumerate(zip(poses, hidden, strict=True))
+        ]
+        series = scale_of_series(slices, cube, OPTIONS, CalibrationOptions())
+        assert isinstance(series.outcome, Calibration), series.outcome.message
+        assert [(one.name, one.rods) for one in series.slices] == [("0.dcm", 5), ("1.dcm", 5)]
+        for alone, pose, name in zip(series.slices, poses, hidden, strict=True):
+            for scale in (alone.linear, alone.newton_raphson):
+                np.testing.assert_allclose([scale.sx, scale.sy], [TRUE.sx, TRUE.sy], rtol=0.01)
+            lines = [line for line, other in enumerate(cube.line_names) if other != name]
+            columns = []
+            for axis in range(8):
+                step = 1e-4 * np.eye(8)[axis]
+                there, back = (
+                    project(
+                        cube,
+                        pose.perturbed(sign * step[2:5], sign * step[5:]),
+                        PixelScale(TRUE.sx + sign * step[0], TRUE.sy + sign * step[1]),
+                    )[0][lines]
+                    for sign in (1, -1)
+                )
+                columns.append((there - back).ravel() / 2e-4)
+            jacobian = np.stack(columns, axis=-1)
+            bound = NOISE_PX * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))[:2]
+            np.testing.assert_allclose(alone.standard_errors, bound, rtol=0.1)
