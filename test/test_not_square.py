@@ -115,6 +115,31 @@ class TestSpots:
         found = find_spots(Slice(image.astype(np.float32), SCALE), RegistrationOptions(threshold=threshold))
         np.testing.assert_allclose(found.centres_px, places[[1, 2, 0, 4, 3]], atol=0.05)
 
+    @pytest.mark.parametrize("threshold", ["auto", 1000.0])
+    @pytest.mark.parametrize("second", [[255.0, 61.0], [251.0, 65.0]], ids=["beside", "below"])
+    def test_two_that_touch_are_two(self, threshold: float | str, second: list[float]) -> None:
+        places = np.array([[250.0, 60.0], second])
+        v, u = np.indices(SHAPE)
+        image = np.full(SHAPE, 40.0)
+        for (x, y), peak in zip(places, (3000.0, 2500.0), strict=True):
+            image += peak * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 1.3**2))
+        image += 5.0 * np.random.default_rng(9).standard_normal(SHAPE)
+        found = find_spots(Slice(image.astype(np.float32), SCALE), RegistrationOptions(threshold=threshold))
+        np.testing.assert_allclose(found.centres_px, places, atol=0.4)
+
+    @pytest.mark.parametrize("turn_deg", [10.0, 80.0])
+    def test_a_long_streak_near_the_edge_is_one(self, turn_deg: float) -> None:
+        """So long that it is looked at anew from its middle; its brightest place is near one of its ends."""
+        turn = math.radians(turn_deg)
+        v, u = np.indices(SHAPE)
+        off = np.stack([u - 275.0, v - 150.0], axis=-1)
+        far, aside = off @ [math.cos(turn), math.sin(turn)], off @ [-math.sin(turn), math.cos(turn)]
+        profile = (1.0 + 0.002 * far) / (1.0 + np.exp((np.abs(far) - 14.0) / 0.8))
+        image = 40.0 + 3000.0 * profile * np.exp(-((aside / 1.0) ** 2) / 2)
+        image += 5.0 * np.random.default_rng(9).standard_normal(SHAPE)
+        found = find_spots(Slice(image.astype(np.float32), PixelScale(0.6, 0.7)), RegistrationOptions())
+        np.testing.assert_allclose(found.centres_px, [[275.0, 150.0]], atol=0.5)
+
     def test_areas_are_those_of_oblong_pixels(self) -> None:
         """12 pixels of 0.325 mm^2: 3.9 mm^2, where square ones would have 3 or 5.07."""
         image = np.full(SHAPE, 40.0)

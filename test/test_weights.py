@@ -14,6 +14,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.registration import recognise_spots
 from stereoreg_ros.solvers.tolerant_calibration import calibrate_tolerantly
 
 SCALE = PixelScale(0.45, 0.6, 0.03)
@@ -116,6 +117,15 @@ def test_pose_and_covariance_are_those_of_generalised_least_squares(seed: int) -
     assert [match.spot for match in result.matches] == rows[lines].tolist()
 
     pose = result.estimate.slice_from_frame
+    predicted, _ = project(frame, pose, SCALE)
+    for match in result.matches:
+        np.testing.assert_array_equal(match.spot_px, spots[match.spot])
+        np.testing.assert_allclose(match.predicted_px, predicted[match.line_index], atol=1e-9)
+        # From the spot to the rod in space, not in the slice.
+        spot = pose.inverse() @ np.append(SCALE.to_mm(match.spot_px), 0.0)
+        start, end = frame.starts[match.line_index], frame.ends[match.line_index]
+        away = np.linalg.norm(np.cross(spot - start, end - start)) / np.linalg.norm(end - start)
+        assert match.residual_mm == pytest.approx(away, rel=1e-9)
     jacobian = by_differences(frame, pose)[lines].reshape(-1, 6)
     ends = [by_ends(frame, pose, line) * frame.tolerances_or(np.nan)[line] for line in lines]
     matrix = SCALE.matrix
@@ -141,6 +151,21 @@ def test_pose_and_covariance_are_those_of_generalised_least_squares(seed: int) -
     expected = turn @ expected @ turn.T
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(result.covariance / scale, expected / scale, atol=0.01)
+
+
+def test_what_is_recognised_is_weighed_alike() -> None:
+    frame = the_frame()
+    spots, covariances, rows = offered(frame, TRUTH, 4)
+    judged = register_spots(spots, frame, SCALE, OPTIONS, PLANE, covariances_px2=covariances)
+    seen = recognise_spots(spots, frame, SCALE, OPTIONS, PLANE, covariances_px2=covariances)
+    assert judged
+    assert seen
+    assert [match.spot for match in seen.matches] == rows[rows >= 0].tolist()
+    np.testing.assert_allclose(seen.covariances_px2, covariances, rtol=1e-12)
+    np.testing.assert_allclose(seen.estimate.covariance, judged.covariance, rtol=0.02, atol=1e-6)
+    found, expected = seen.estimate.scanner_from_frame, judged.scanner_from_frame
+    np.testing.assert_allclose(found.translation, expected.translation, atol=0.01)
+    np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-4)
 
 
 def test_the_measured_scale_is_that_of_the_same_spots_in_the_rods_order() -> None:
