@@ -344,7 +344,8 @@ def _joint(frame: Frame, matched: Sequence[Registration | Recognition], with_she
     start = richest.scale
     change = max(abs(first.scale.sx / start.sx - 1), abs(first.scale.sy / start.sy - 1))
     if first.converged and change < 2 * _STEP:
-        start = first.scale
+        # A shear that is not measured stays as it is; that solution has none.
+        start = replace(start, sx=first.scale.sx, sy=first.scale.sy)
     rotations, translations, spots_px, used, covariances = _posed(frame, matched)
     exact = calibrate_jointly(frame, rotations, translations, spots_px, used, covariances, start, with_shear)
     return calibrate_tolerantly(

@@ -74,6 +74,19 @@ def test_standard_errors_are_roots_of_the_variances() -> None:
     assert RECORD.standard_errors == pytest.approx((0.0004, 0.0005, 0.0002))
 
 
+def test_each_number_of_the_configured_scale_is_kept_and_counts(tmp_path: Path) -> None:
+    """No two of them alike, lest one stand for another."""
+    configured = PixelScale(0.52, 0.47, 0.003)
+    path = tmp_path / "scale.yaml"
+    save_calibration(path, replace(RECORD, configured=configured))
+    record = load_calibration(path)
+    assert record is not None
+    assert (record.scale, record.configured) == (RECORD.scale, configured)
+    assert record.replaces(replace(configured, sx=0.52 * (1 + 1e-9)))
+    for name in ("sx", "sy", "shear"):
+        assert not record.replaces(replace(configured, **{name: getattr(configured, name) + 1e-5}))
+
+
 @pytest.mark.parametrize("size", [2, 3])
 def test_of_a_file_without_correlations_the_largest_covariance_is_taken(tmp_path: Path, size: int) -> None:
     errors = np.array([0.001, 0.002, 0.0005])[:size]

@@ -494,6 +494,17 @@ class TestCalibrate:
         assert code == 1
         assert "nothing" in errors
 
+    def test_one_unreadable_file_is_named_and_changes_the_exit_status(self, stereoreg, off_series, tmp_path):
+        """What the others say is told all the same."""
+        broken = tmp_path / "broken.dcm"
+        broken.write_bytes(b"\0" * 128 + b"DICM" + b"\xff" * 40)
+        code, output, errors = stereoreg("calibrate", "--frame", "cube6", *CHANGE, "--json", off_series, broken)
+        assert code == 1
+        assert "broken.dcm" in errors
+        record = json.loads(output)
+        assert record["outcome"] == "accepted"
+        assert len(record["slices"]) == 4
+
     def test_spacings_that_differ(self, stereoreg, off_series, tmp_path):
         other = tmp_path / "other.dcm"
         write_slice(other, np.zeros((64, 64), np.uint16), PixelSpacing=[0.7, 0.7])

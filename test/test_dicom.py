@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dicom_files import CATPHAN, SHARED_DATA, real, write_slice
+from pydicom import dcmread
 from pydicom.encaps import encapsulate
 from pydicom.uid import (
     EnhancedCTImageStorage,
@@ -81,6 +82,21 @@ def test_padding_never_looks_like_metal(tmp_path):
     assert (hu[1] == 63530 - 1024).all()
     path = write_slice(tmp_path / "b.dcm", stored, PixelPaddingValue=63536, PixelPaddingRangeLimit=63000)
     assert read_slice(path).ct_slice.hu.max() == stored[2:].max() - 1024
+
+
+@pytest.mark.parametrize(("written", "stored_as"), [(0x8000, -32768), (0xF830, -2000), (2000, 2000), (0x7FFF, 32767)])
+def test_padding_of_signed_pixels_may_be_written_as_an_unsigned_number(tmp_path, written, stored_as):
+    """0x8000, the least of all values, is the usual one; half of the range is no unsigned number yet."""
+    stored = IMAGE.astype(np.int16)
+    stored[0] = stored_as
+    path = write_slice(tmp_path / "a.dcm", stored, PixelPaddingValue=stored_as)
+    # pydicom itself writes a signed number where the pixels are signed: the same two bytes, under another VR.
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\x28\x00\x20\x01SS", b"\x28\x00\x20\x01US"))
+    assert dcmread(path)["PixelPaddingValue"].value == written
+    hu = read_slice(path).ct_slice.hu
+    np.testing.assert_array_equal(hu[1:], IMAGE[1:] - 1024.0)
+    np.testing.assert_array_equal(hu[0], IMAGE[1:].min() - 1024.0)
 
 
 def test_plane_of_an_oblique_slice(tmp_path):

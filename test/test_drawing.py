@@ -80,6 +80,23 @@ class TestColours:
         picture = draw_overlay(a_slice(), result)
         assert (np.abs(picture.astype(int) - BLUE).max(axis=-1) <= 6).sum() == 0
 
+    def test_places_are_those_of_the_pixels_in_an_oblong_image(self) -> None:
+        """300 columns of 200 rows, with a shear: what is found to the right of a square image is drawn there."""
+        scale = PixelScale(0.5, 0.6, 0.05)
+        pose = Pose(POSE.rotation, np.array([135.0, 50.0, 3.0]))
+        predicted, _ = project(FRAME, pose, scale)
+        (matched, missing) = (0, MISSING)
+        assert (predicted[[matched, missing], 0] > 200).all()
+        spots = np.array([predicted[matched], [285.0, 180.0]])
+        match = Match("a", matched, 0, spots[0], predicted[matched], 0.0)
+        estimate = PoseEstimate(pose, pose, 1e-4 * np.eye(6), (match,), 5.0, -20.0)
+        ct_slice = Slice(a_slice((200, 300)).hu, scale)
+        picture = draw_overlay(ct_slice, Registration(FRAME, scale, RegistrationOptions(), spots, estimate))
+        assert picture.shape == (4 * 200 + HEADER, 4 * 300, 3)
+        for place, colour in ((spots[0], GREEN), (spots[1], YELLOW), (predicted[missing], BLUE)):
+            assert count(picture, colour, place, self.ZOOM) > 30
+        assert count(picture, GREEN, spots[1], self.ZOOM) == 0
+
     def test_the_headline_says_the_outcome(self) -> None:
         good, doubtful = draw_overlay(a_slice(), accepted()), draw_overlay(a_slice(), accepted(caution="a caution"))
         estimate, spots = an_estimate()

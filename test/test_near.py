@@ -52,6 +52,24 @@ def test_five_rods_among_thirty_spots_are_sure_near_the_pose_before(mm: float, d
     assert untold < 30
 
 
+def test_the_guess_is_of_the_frame_in_the_scanner_whatever_the_slices_plane() -> None:
+    """As sure, and as near, as where the scanner is the slice."""
+    plane = Pose(rotation_exp(np.array([0.6, -0.4, 1.0])), np.array([30.0, -200.0, 500.0]))
+    rng = np.random.default_rng(9)
+    problem = random_spot_set(rng, CUBE, SpotSetSettings(SCANNER, visible_rods=6, false_spots=8, noise_px=0.3))
+    guess = moved(rng, problem.slice_from_frame, 2.0, 1.0)
+    flat = register_spots(problem.spots_px, CUBE, SCALE, PERFECT, previous=guess)
+    oblique = register_spots(problem.spots_px, CUBE, SCALE, PERFECT, plane, previous=plane @ guess)
+    without = register_spots(problem.spots_px, CUBE, SCALE, PERFECT, plane)
+    assert flat
+    assert oblique
+    assert without
+    assert oblique.estimate.log10_false_alarms == pytest.approx(flat.estimate.log10_false_alarms, abs=1e-6)
+    assert oblique.estimate.log10_false_alarms < without.estimate.log10_false_alarms - 3
+    expected = plane @ flat.scanner_from_frame
+    np.testing.assert_allclose(oblique.scanner_from_frame.translation, expected.translation, atol=1e-6)
+
+
 def test_says_the_same_as_without_a_guess() -> None:
     rng = np.random.default_rng(2)
     settings = SpotSetSettings(SCANNER, visible_rods=6, false_spots=12, noise_px=0.3)

@@ -9,14 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Vector3Stamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from ros_process import RosClient, node_process
 from std_srvs.srv import Trigger
-from test_register_node import CUBE, SCALE, SCANNER, Bench, assert_near, image_of, rendered
+from test_register_node import CUBE, SCALE, SCANNER, Bench, assert_near, image_of, of_stamp, rendered, values_of
 from test_slice_spacing import OTHER, SpacedBench
 
+from stereoreg_ros import PixelScale, Pose, register_slice
+from stereoreg_ros.calibration_file import CalibrationRecord, load_calibration, save_calibration
+from stereoreg_ros.geometry.pose import rotation_exp
+from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.nodes.conversions import covariance_to_message, pose_to_message
 from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING
-from stereoreg_ros.simulation import PlacedFrame, random_pose, render_slice
+from stereoreg_ros.simulation import PlacedFrame, centred_pose, random_pose, render_slice
 
 SLICES = [rendered(seed, noise_hu=5.0) for seed in range(40, 46)]
 LARGER = 1.03
@@ -59,6 +64,31 @@ def forget_slices(bench: Bench) -> None:
     assert bench.set(pixel_spacing=[SCALE.sx, SCALE.sy]) == ""
 
 
+def recalibrate(bench: Bench) -> Trigger.Response:
+    return bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
+
+
+def published_covariance(bench: Bench, hu: np.ndarray) -> np.ndarray:
+    """The covariance (6, 6) in m and rad that is published for a slice, which must be accepted."""
+    stamp = bench.send(image_of(hu))
+    bench.pose(stamp)
+    message = bench.client.wait_for(lambda: of_stamp(bench.with_covariance, stamp), "the pose with its covariance")
+    return np.reshape(message.pose.covariance, (6, 6))
+
+
+def covariance_of(hu: np.ndarray, scale: PixelScale, scale_covariance: np.ndarray | None) -> np.ndarray:
+    """What it has to be where the scale was measured with such errors, or is known."""
+    result = register_slice(Slice(hu, scale), CUBE, scale_covariance=scale_covariance)
+    assert result, result.message
+    return np.reshape(covariance_to_message(result.covariance), (6, 6))
+
+
+def assert_alike(found: np.ndarray, expected: np.ndarray) -> None:
+    """Covariances that are the same, to a thousandth of the variances."""
+    stds = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found / np.outer(stds, stds), expected / np.outer(stds, stds), atol=1e-3)
+
+
 def wait_until_running(bench: Bench) -> None:
     """Until the node has taken up a call of `recalibrate`: requests of several clients come in any order."""
 
@@ -84,7 +114,7 @@ def test_from_a_wrong_spacing(client, factors):
         bench.warm_up(bench.diagnostics)
         for hu, _ in SLICES:
             bench.status(bench.send(image_of(hu)))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
+        response = recalibrate(bench)
         assert response.success, response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
         np.testing.assert_allclose(measured, [SCALE.sx, SCALE.sy], rtol=3e-3)
@@ -103,7 +133,7 @@ def test_spacing_that_came_with_the_slices_is_not_made_to_fit_the_frame(client):
         forget_slices(bench)
         for seed in range(4):
             bench.status(bench.send_spaced(of_a_larger_frame(seed), SCALE))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
+        response = recalibrate(bench)
         assert not response.success
         assert "scanner, or frame file?" in response.message
         assert "came with the slices is (0.5000, 0.6000) mm/pixel, the one measured is (0.48" in response.message
@@ -113,7 +143,7 @@ def test_spacing_that_came_with_the_slices_is_not_made_to_fit_the_frame(client):
 
         # On purpose it may be changed; the slices are still there.
         assert bench.set(calibration_max_change=0.15) == ""
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
+        response = recalibrate(bench)
         assert response.success, response.message
         assert "cannot be told apart" in response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
@@ -128,7 +158,7 @@ def test_spacing_that_was_typed_in_is(client):
         forget_slices(bench)
         for seed in range(4):
             bench.status(bench.send(image_of(of_a_larger_frame(seed))))
-        response = bench.client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
+        response = recalibrate(bench)
         assert response.success, response.message
         assert "cannot be told apart" in response.message
         assert re.search(r"would have to be (2\.[5-9]|3\.[0-5]) % larger than its file says", response.message)
@@ -199,10 +229,12 @@ def test_the_measured_spacing_outlives_the_node(client, tmp_path: Path):
     with node_process("register_node", *told) as process:
         bench = Bench(client, "/kept", "/kept/image")
         bench.warm_up(bench.diagnostics)
-        for hu, _ in SLICES:
+        for hu, _ in SLICES[:3]:
             bench.status(bench.send(image_of(hu)))
-        response = client.call(Trigger, f"{bench.node}/recalibrate", deadline_s=90.0, again_after_s=None)
-        assert response.success, response.message
+        # Twice: what was measured in place of the configured one stands for that, not for the one measured before.
+        for _ in range(2):
+            response = recalibrate(bench)
+            assert response.success, response.message
         (measured,) = client.get_parameters(bench.node, "pixel_spacing")
         process.stop(signal.SIGKILL)
     with node_process("register_node", *told) as process:
@@ -213,6 +245,120 @@ def test_the_measured_spacing_outlives_the_node(client, tmp_path: Path):
         assert client.call(Trigger, f"{bench.node}/reset_calibration").success
         assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == list(configured)
         assert not path.exists()
+
+
+def test_the_published_covariance_holds_that_of_the_measured_scale(client, tmp_path: Path):
+    """Measured, forgotten and measured once more: as uncertain as the scale in use is, each time."""
+    path = tmp_path / "scale.yaml"
+    configured = PixelScale(1.01 * SCALE.sx, 0.99 * SCALE.sy)
+    # No two alike.
+    covariance = 1e-7 * np.array([[9.0, -4.0, 1.0], [-4.0, 25.0, 2.0], [1.0, 2.0, 4.0]])
+    rows = tuple(tuple(float(value) for value in row) for row in covariance)
+    save_calibration(
+        path, CalibrationRecord(SCALE, configured, rows, "cube6", 10, 60, "2026-01-01T00:00:00+00:00", "test")
+    )
+    hu, _ = SLICES[0]
+    with node_process(
+        "register_node", *arguments("/unsure", (configured.sx, configured.sy), f"calibration_file:={path}")
+    ):
+        bench = Bench(client, "/unsure", "/unsure/image")
+        bench.warm_up(bench.diagnostics, bench.with_covariance)
+        expected = covariance_of(hu, SCALE, covariance)
+        assert_alike(published_covariance(bench, hu), expected)
+        # Told as it truly is, it is as sure as any that is configured.
+        assert bench.set(pixel_spacing=[SCALE.sx, SCALE.sy]) == ""
+        plain = covariance_of(hu, SCALE, None)
+        assert expected[0, 0] > 1.2 * plain[0, 0]
+        assert_alike(published_covariance(bench, hu), plain)
+        for other, _ in SLICES[:2]:
+            bench.status(bench.send(image_of(other)))
+        response = recalibrate(bench)
+        assert response.success, response.message
+        record = load_calibration(path)
+        assert record is not None
+        assert len(record.covariance) == 2
+        measured = covariance_of(hu, record.scale, np.array(record.covariance))
+        assert measured[0, 0] > 1.05 * plain[0, 0]
+        assert_alike(published_covariance(bench, hu), measured)
+        assert client.call(Trigger, f"{bench.node}/reset_calibration").success
+        assert_alike(published_covariance(bench, hu), plain)
+
+
+def test_slices_of_before_a_change_are_not_measured_from(client):
+    with node_process("register_node", *arguments("/before", (SCALE.sx, SCALE.sy), "calibration_timeout:=0.0")):
+        bench = Bench(client, "/before", "/before/image")
+        bench.warm_up(bench.diagnostics)
+        changes = (
+            {"pixel_spacing": [1.001 * SCALE.sx, SCALE.sy]},
+            {"pixel_shear": 0.0005},
+            {"frame_file": "cube5"},
+        )
+        for change in changes:
+            for hu, _ in SLICES[:2]:
+                bench.status(bench.send(image_of(hu)))
+            assert bench.set(**change) == ""
+            response = recalibrate(bench)
+            assert not response.success
+            assert response.message == "no slice has been accepted yet, nothing to calibrate from"
+        # And those of afterwards are.
+        assert bench.set(frame_file="cube6") == ""
+        for hu, _ in SLICES[:2]:
+            bench.status(bench.send(image_of(hu)))
+        response = recalibrate(bench)
+        assert response.success, response.message
+        # What was set by the node itself is no change: the slices are still there.
+        response = recalibrate(bench)
+        assert response.success, response.message
+
+
+def test_what_is_measured_is_not_set_where_frame_or_spacing_was_changed_meanwhile(client):
+    """Called before there is a slice, it waits for slices; these come after the change."""
+    with node_process("register_node", *arguments("/change", (SCALE.sx, SCALE.sy), "calibration_timeout:=60.0")):
+        bench = Bench(client, "/change", "/change/image")
+        bench.warm_up(bench.diagnostics)
+        other = [1.004 * SCALE.sx, SCALE.sy]
+        for change, told in (({"pixel_spacing": other}, other), ({"frame_file": "cube5"}, other)):
+            forget_slices(bench)
+            assert bench.set(pixel_spacing=other if "frame_file" in change else [SCALE.sx, SCALE.sy]) == ""
+            service = client.node.create_client(Trigger, f"{bench.node}/recalibrate")
+            client.wait_for(service.service_is_ready, "the service")
+            answer = service.call_async(Trigger.Request())
+            wait_until_running(bench)
+            assert bench.set(**change) == ""
+            for hu, _ in SLICES[:3]:
+                bench.status(bench.send(image_of(hu)))
+            client.wait_for(answer.done, "the answer", deadline_s=90.0)
+            client.node.destroy_client(service)
+            assert not answer.result().success
+            assert "the frame or the pixel spacing was changed meanwhile" in answer.result().message
+            assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == told
+            assert values_of(bench.status(bench.send(image_of(SLICES[0][0]))))["calibration"] == "configured"
+
+
+def test_how_the_frame_stands_in_a_tilted_gantry_is_said_of_the_scanner(client):
+    """By 20 degrees, where the frame may be turned by 8: without its plane no slice could be measured from."""
+    tilted = Pose(rotation_exp(np.array([np.radians(20.0), 0.0, 0.0])), np.array([0.0, 0.0, 100.0]))
+    nominal = centred_pose(CUBE, SCANNER, rotation=tilted.rotation.T)
+    rng = np.random.default_rng(8)
+    slices = [
+        render_slice(
+            [PlacedFrame(CUBE, random_pose(rng, CUBE, SCANNER, max_tilt_deg=3.0, nominal=nominal))], SCANNER, rng
+        )
+        for _ in range(2)
+    ]
+    more = ("max_rotation_deg:=8.0", "slice_pose_required:=true", "calibration_timeout:=0.0")
+    with node_process("register_node", *arguments("/gantry", (SCALE.sx, SCALE.sy), *more)):
+        bench = Bench(client, "/gantry", "/gantry/image")
+        bench.warm_up(bench.diagnostics)
+        for one in slices:
+            message = PoseStamped(pose=pose_to_message(tilted))
+            message.header.frame_id, message.header.stamp = "ct", bench.next_stamp()
+            client.publish("/gantry/slice_pose", message)
+            stamp = bench.send(image_of(one.hu), stamp=message.header.stamp)
+            assert values_of(bench.status(stamp))["outcome"] == "accepted"
+        response = recalibrate(bench)
+        assert response.success, response.message
+        assert re.search(r"from 2 slices with 1[0-2] rods", response.message)
 
 
 @pytest.mark.parametrize("content", ["kind: something else\n", "not: [yaml", ""])

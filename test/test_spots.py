@@ -140,6 +140,25 @@ class TestWhatIsASpot:
         np.testing.assert_allclose(spots_of(image), [[21, 21], [26, 21]], atol=0.05)
 
 
+class TestLimitOfTheError:
+    @pytest.mark.parametrize("along_columns", [False, True])
+    @pytest.mark.parametrize(("tail", "is_a_spot"), [(16.0, True), (23.0, False)])
+    def test_what_has_no_centre_to_four_fifths_of_a_pixel_is_none(
+        self, tail: float, is_a_spot: bool, along_columns: bool
+    ) -> None:
+        """A comet: the longer its tail, the less it is known where its middle is; 0.71 and 0.81 pixel."""
+        v, u = np.indices((60, 120))
+        along = u - 30.0
+        profile = np.where(along < 0, np.exp(-((along / 0.8) ** 2) / 2), np.exp(-along / tail))
+        image = 40.0 + 3000.0 * profile * np.exp(-(((v - 30.0) / 1.2) ** 2) / 2)
+        found = find_spots(
+            Slice((image.T if along_columns else image).astype(np.float32), SCALE), replace(OPTIONS, threshold=800.0)
+        )
+        assert len(found) == is_a_spot
+        stds = np.sqrt(np.linalg.eigvalsh(found.covariances_px2))
+        assert stds[:, 1] == pytest.approx([0.706] * is_a_spot, abs=0.02)
+
+
 class TestHostileImages:
     @pytest.mark.parametrize("value", [3.4e8, -3.4e8, 1e9, 65535.0, 1e-30])
     @pytest.mark.parametrize("threshold", [2000.0, 0.0, -500.0, "auto"])

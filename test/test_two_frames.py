@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice
+from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice, register_spots
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.result import Refusal, Registration
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, random_pose, render_slice
+from stereoreg_ros.spots import find_spots
 
 SCANNER = ScannerSettings()
 # Between the cubes' middles; the paper's stand 118.29 mm apart.
@@ -163,3 +164,39 @@ def test_of_two_that_want_the_same_spots_the_surer_has_them_in_any_order(scenes,
         assert other.frame is part
         assert len(other.spots_px) == 6
     assert twins_at_odds(ct_slice, [FIRST, part, SECOND]) == twins_at_odds(ct_slice, [SECOND, part, FIRST])[::-1]
+
+
+# Of (sx, sy, shear).
+SCALE_COVARIANCE = np.array([[4.0, 1.0, 0.6], [1.0, 9.0, -0.8], [0.6, -0.8, 2.0]]) * 1e-6
+
+
+def test_one_that_is_sought_again_is_as_uncertain_as_what_is_left_to_it() -> None:
+    """Two cubes of a kind, both last seen at the same place: the second takes what the first has left."""
+    rng = np.random.default_rng(7)
+    poses = [
+        centred_pose(FIRST, SCANNER, (share, 0.45), rotation_exp(np.array([0.1, -0.1, turn])))
+        for share, turn in ((0.3, 0.2), (0.7, 0.9))
+    ]
+    ct_slice = render_slice([PlacedFrame(FIRST, pose) for pose in poses], SCANNER, rng)
+    options = RegistrationOptions(spot_noise_px=0.001)
+    one, other = register_frames(ct_slice, [FIRST, FIRST], options, [poses[0]] * 2, SCALE_COVARIANCE)
+    assert_right(one, FIRST, poses[0])
+    assert_right(other, FIRST, poses[1])
+    assert isinstance(one, Registration)
+    assert isinstance(other, Registration)
+    found = find_spots(ct_slice, options)
+    left = np.setdiff1d(np.arange(len(found)), [match.spot for match in one.matches])
+    expected = register_spots(
+        found.centres_px[left],
+        FIRST,
+        ct_slice.scale,
+        options,
+        slice_area_mm2=512 * 512 * 0.25,
+        previous=poses[0],
+        covariances_px2=found.covariances_px2[left],
+        scale_covariance=SCALE_COVARIANCE,
+    )
+    assert isinstance(expected, Registration)
+    np.testing.assert_array_equal(other.covariances_px2, expected.covariances_px2)
+    np.testing.assert_array_equal(other.covariance, expected.covariance)
+    np.testing.assert_array_equal(other.scanner_from_frame.translation, expected.scanner_from_frame.translation)
