@@ -104,9 +104,18 @@ def test_of_a_file_without_correlations_the_largest_covariance_is_taken(tmp_path
 
 
 def test_belongs_to_the_scale_in_place_of_which_it_was_measured() -> None:
-    assert RECORD.replaces(PixelScale(0.5, 0.5))
-    assert not RECORD.replaces(PixelScale(0.5, 0.51))
-    assert not RECORD.replaces(PixelScale(0.5, 0.5, 0.01))
+    record = replace(RECORD, configured=PixelScale(0.5, 0.6, 0.01))
+    assert record.replaces(PixelScale(0.5, 0.6, 0.01))
+    for other in (
+        PixelScale(0.50001, 0.6, 0.01),
+        PixelScale(0.5, 0.60001, 0.01),
+        PixelScale(0.6, 0.5, 0.01),
+        PixelScale(0.5, 0.6, -0.01),
+        PixelScale(0.5, 0.6),
+    ):
+        assert not record.replaces(other)
+    # What a file's decimals may lose.
+    assert record.replaces(PixelScale(0.5 * (1 + 5e-7), 0.6, 0.01))
 
 
 def test_killed_while_it_writes_the_file_is_the_old_or_the_new_one(tmp_path: Path) -> None:
@@ -151,6 +160,37 @@ def test_what_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: 
     monkeypatch.undo()
     assert load_calibration(path) == RECORD
     assert [entry.name for entry in tmp_path.iterdir()] == ["scale.yaml"]
+
+
+def test_a_write_and_a_removal_are_on_the_disk_before_they_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A renamed or removed file comes back after a power cut, unless its folder is synced afterwards."""
+    steps: list[str] = []
+    real_fsync, real_replace, real_unlink = os.fsync, os.replace, Path.unlink
+
+    def fsync(descriptor: int) -> None:
+        is_folder = os.path.samestat(os.fstat(descriptor), tmp_path.stat())
+        steps.append("sync the folder" if is_folder else "sync the file")
+        real_fsync(descriptor)
+
+    def replace_file(source: Path, target: Path) -> None:
+        steps.append("rename")
+        real_replace(source, target)
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        steps.append("remove")
+        real_unlink(path, missing_ok)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace_file)
+    monkeypatch.setattr(Path, "unlink", unlink)
+    path = tmp_path / "scale.yaml"
+    save_calibration(path, RECORD)
+    assert steps == ["sync the file", "rename", "sync the folder"]
+    steps.clear()
+    remove_calibration(path)
+    assert steps == ["remove", "sync the folder"]
 
 
 def content() -> dict[str, object]:

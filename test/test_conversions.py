@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Point, PointStamped, PoseStamped, Quaternion
+from geometry_msgs.msg import Point, PointStamped, PoseStamped, Quaternion, Vector3, Vector3Stamped
 from geometry_msgs.msg import Pose as PoseMessage
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
 
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
+from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes import conversions
 from stereoreg_ros.nodes.conversions import MAX_SIDE_PX, MessageError
+from stereoreg_ros.nodes.transforms import transform_of
 
 PIXEL_TYPES = {"16SC1": "i2", "16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
@@ -199,3 +201,24 @@ def test_point_there_and_back():
 def test_faulty_point_is_named():
     with pytest.raises(MessageError, match=r"point is .*nan.*, expected finite numbers of metres"):
         conversions.point_from_message(PointStamped(point=Point(x=float("nan"))))
+
+
+def test_pixel_scale_in_metres_there_and_back():
+    message = conversions.scale_to_message(PixelScale(0.4, 0.7, -0.02))
+    assert (message.x, message.y, message.z) == pytest.approx((4e-4, 7e-4, -2e-5))
+    back = conversions.scale_from_message(Vector3Stamped(vector=message))
+    assert (back.sx, back.sy, back.shear) == pytest.approx((0.4, 0.7, -0.02))
+    with pytest.raises(MessageError, match="pixel spacing sy is -700"):
+        conversions.scale_from_message(Vector3Stamped(vector=Vector3(x=0.4, y=-0.7, z=0.0)))
+
+
+def test_transform_is_the_pose_from_its_axes_to_the_frames():
+    pose = Pose(rotation_exp(np.array([0.4, -2.0, 1.1])), np.array([12.5, -700.0, 3.25]))
+    stamped_pose = PoseStamped(pose=conversions.pose_to_message(pose))
+    stamped_pose.header.frame_id = "scanner"
+    stamped_pose.header.stamp.sec = 7
+    transform = transform_of(stamped_pose, "stereotactic_frame")
+    assert (transform.header, transform.child_frame_id) == (stamped_pose.header, "stereotactic_frame")
+    moved = transform.transform.translation
+    assert (moved.x, moved.y, moved.z) == pytest.approx((0.0125, -0.7, 0.00325))
+    assert transform.transform.rotation == stamped_pose.pose.orientation

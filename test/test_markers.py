@@ -1,77 +1,141 @@
-"""What RViz shows of a slice, by hand: in the scanner's axes, in metres, oblong as the slice is."""
+"""What RViz shows: each rod, spot, plane, error and target where it is, in metres and in scanner axes."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
+from geometry_msgs.msg import Point, PointStamped, PoseStamped, Vector3
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from stereoreg_ros import PixelScale, Pose, RegistrationOptions, load_frame
-from stereoreg_ros.geometry.pose import Array, rotation_exp
-from stereoreg_ros.geometry.projection import project
-from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros import RegistrationOptions
+from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.pose import Array, Pose
+from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.nodes.conversions import pose_from_message
 from stereoreg_ros.nodes.markers import markers_of
-from stereoreg_ros.result import Match, PoseEstimate, Registration
+from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 
-ROWS, COLUMNS = 20, 30
-SCALE = PixelScale(0.5, 2.0, 0.1)
-# A quarter turn about x: the rows go upwards in the scanner.
-PLANE = Pose(rotation_exp(np.array([math.pi / 2, 0.0, 0.0])), np.array([10.0, 20.0, 30.0]))
-FRAME = load_frame("cube6")
-SLICE_FROM_FRAME = Pose(rotation_exp(np.array([0.1, 0.2, 0.3])), np.array([40.0, 50.0, 2.0]))
-VARIANCES = np.array([1.0, 4.0, 9.0, 0.0, 0.0, 0.0])
-
-
-def shown() -> dict[str, list[Marker]]:
-    """Markers by their namespaces, of a frame with spots of its first two rods."""
-    predicted, _ = project(FRAME, SLICE_FROM_FRAME, SCALE)
-    matches = tuple(Match(FRAME.line_names[k], k, k, predicted[k], predicted[k], 0.0) for k in (0, 1))
-    estimate = PoseEstimate(SLICE_FROM_FRAME, PLANE @ SLICE_FROM_FRAME, np.diag(VARIANCES), matches, 1.0, -20.0)
-    result = Registration(FRAME, SCALE, RegistrationOptions(), predicted, estimate)
-    ct_slice = Slice(np.zeros((ROWS, COLUMNS), np.float32), SCALE, PLANE)
-    named: dict[str, list[Marker]] = {}
-    for marker in markers_of(ct_slice, [(result, "frame")], Header(frame_id="ct")).markers:
-        named.setdefault(marker.ns, []).append(marker)
-    return named
+HEADER = Header(frame_id="scanner")
+STARTS = np.array([[0.0, 0, -30], [40, 0, -30], [0, 50, -30]])
+ENDS = np.array([[0.0, 0, 30], [50, 20, 30], [10, 50, 40]])
+FRAME = Frame("three", ("a", "b", "c"), STARTS, ENDS, np.array([1.0, 2.0, 3.0]))
+# A quarter turn about z: x of the slice is y of the scanner.
+SLICE = Slice(
+    np.zeros((30, 20), np.float32),
+    PixelScale(0.5, 2.0, 0.1),
+    Pose(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.array([100.0, 200.0, 300.0])),
+)
+POSE = Pose(Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix(), np.array([12.0, -30.0, 500.0]))
+COVARIANCE = np.diag([0.04, 0.25, 1.0, 0.0, 0.0, 0.0])
+TARGET = (10.0, 20.0, 30.0)
 
 
-def points_mm(marker: Marker) -> Array:
-    return 1e3 * np.array([[point.x, point.y, point.z] for point in marker.points])
+def registration(covariance: Array = COVARIANCE) -> Registration:
+    """Of which the first and the last rod have a spot."""
+    matches = tuple(
+        Match(FRAME.line_names[line], line, line, np.array(spot_px), np.array(spot_px), 0.1)
+        for line, spot_px in ((0, [4.0, 10.0]), (2, [0.0, 20.0]))
+    )
+    estimate = PoseEstimate(SLICE.scanner_from_slice.inverse() @ POSE, POSE, covariance, matches, 1.0, -9.0)
+    spots_px = np.array([[4.0, 10.0], [1.0, 1.0], [0.0, 20.0]])
+    return Registration(FRAME, SLICE.scale, RegistrationOptions(target_in_frame_mm=TARGET), spots_px, estimate)
 
 
-def test_the_slices_outline_runs_around_its_pixels() -> None:
-    (outline,) = shown()["slice"]
-    assert outline.type == Marker.LINE_STRIP
-    # Half a pixel beyond the centres of the outermost ones; y of the slice is z of the scanner.
-    corners_px = np.array([[-0.5, -0.5], [29.5, -0.5], [29.5, 19.5], [-0.5, 19.5], [-0.5, -0.5]])
-    x, y = 0.5 * corners_px[:, 0] + 0.1 * corners_px[:, 1], 2.0 * corners_px[:, 1]
-    np.testing.assert_allclose(points_mm(outline), np.stack([x + 10, np.full(5, 20.0), y + 30], axis=-1), atol=1e-9)
+def shown(kind: int, covariance: Array = COVARIANCE) -> list[Marker]:
+    found = markers_of(SLICE, [(registration(covariance), "three")], HEADER).markers
+    return [one for one in found if one.type == kind and one.action == Marker.ADD]
 
 
-def test_spots_and_rods_are_where_the_scanner_has_them() -> None:
-    markers = shown()["frame"]
-    rods = [marker for marker in markers if marker.type == Marker.CYLINDER]
-    assert [rod.color.g > rod.color.r for rod in rods] == [True, True, False, False, False, False]
-    scanner_from_frame = PLANE @ SLICE_FROM_FRAME
+def metres(at: Point | Vector3) -> Array:
+    return np.array([at.x, at.y, at.z])
+
+
+def assert_points(found: list[Point], expected_mm: ArrayLike) -> None:
+    np.testing.assert_allclose([metres(one) for one in found], np.array(expected_mm) / 1000, atol=1e-12)
+
+
+def test_everything_shown_before_goes_first_and_nothing_has_the_name_and_number_of_another() -> None:
+    found = markers_of(SLICE, [(registration(), "one"), (registration(), "other")], HEADER, PointStamped()).markers
+    assert [one.action for one in found] == [Marker.DELETEALL] + [Marker.ADD] * (len(found) - 1)
+    keys = [(one.ns, one.id) for one in found[1:]]
+    assert len(set(keys)) == len(keys)
+    assert {one.ns for one in found[1:]} == {"slice", "target", "one", "other"}
+    assert {one.header.frame_id for one in found} == {"scanner"}
+
+
+def test_of_a_refused_frame_nothing_is_shown_but_the_slice() -> None:
+    refusal = Refusal(FRAME, SLICE.scale, np.zeros((0, 2)), "no_consensus", "", ())
+    found = markers_of(SLICE, [(refusal, "three")], HEADER).markers
+    assert [(one.action, one.ns) for one in found] == [(Marker.DELETEALL, ""), (Marker.ADD, "slice")]
+
+
+def test_the_plane_goes_around_the_pixels_from_their_outer_edges() -> None:
+    """20 columns of 0.5 mm along y of the scanner, 30 rows of 2 mm against its x, each 0.1 mm aside of the one before."""
+    (plane,) = shown(Marker.LINE_STRIP)
+    left, top, right, bottom = -0.5, -0.5, 19.5, 29.5
+    corners_px = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
+    corners = [(0.5 * u + 0.1 * v, 2.0 * v) for u, v in corners_px]
+    assert_points(plane.points, [[100 - y, 200 + x, 300.0] for x, y in corners])
+
+
+def test_rods_stand_where_the_pose_has_them_as_long_and_thick_as_they_are() -> None:
+    rods = shown(Marker.CYLINDER)
+    assert len(rods) == 3
     for line, rod in enumerate(rods):
-        middle = scanner_from_frame @ (0.5 * (FRAME.starts[line] + FRAME.ends[line]))
-        at = rod.pose.position
-        np.testing.assert_allclose(1e3 * np.array([at.x, at.y, at.z]), middle, atol=1e-9)
-        assert 1e3 * rod.scale.z == pytest.approx(np.linalg.norm(FRAME.ends[line] - FRAME.starts[line]))
-    (spots,) = (marker for marker in markers if marker.type == Marker.SPHERE_LIST)
-    predicted, _ = project(FRAME, SLICE_FROM_FRAME, PixelScale(1.0, 1.0))
-    in_slice = np.column_stack([predicted[:2], np.zeros(2)])
-    np.testing.assert_allclose(points_mm(spots), PLANE @ in_slice, atol=1e-6)
+        pose = pose_from_message(PoseStamped(pose=rod.pose))
+        np.testing.assert_allclose(pose.translation, POSE @ ((STARTS[line] + ENDS[line]) / 2), atol=1e-9)
+        along = POSE.rotation @ (ENDS[line] - STARTS[line])
+        length = float(np.linalg.norm(along))
+        np.testing.assert_allclose(pose.rotation[:, 2], along / length, atol=1e-9)
+        np.testing.assert_allclose(metres(rod.scale), np.array([line + 1.0, line + 1.0, length]) / 1000)
 
 
-def test_the_ellipsoid_has_the_diameters_that_hold_95_percent() -> None:
-    (ellipsoid,) = (marker for marker in shown()["frame"] if marker.type == Marker.SPHERE)
-    # The root of chi-square's 95 % for three numbers is 2.7955 standard deviations, to either side.
-    diameters = 1e3 * np.array([ellipsoid.scale.x, ellipsoid.scale.y, ellipsoid.scale.z])
-    np.testing.assert_allclose(np.sort(diameters), 2 * 2.7955 * np.array([1.0, 2.0, 3.0]), rtol=1e-4)
+def test_only_a_rod_without_a_spot_is_red() -> None:
+    assert ["red" if one.color.r > one.color.g else "green" for one in shown(Marker.CYLINDER)] == [
+        "green",
+        "red",
+        "green",
+    ]
+
+
+def test_only_the_spots_of_rods_are_shown_where_they_lie_in_the_scanner() -> None:
+    (spots,) = shown(Marker.SPHERE_LIST)
+    # (4, 10) pixel are 2 mm and the tenth row's 1 mm along x of the slice, and 20 mm along its y.
+    assert_points(spots.points, [[100 - 20, 200 + 3, 300.0], [100 - 40, 202.0, 300.0]])
+
+
+def test_the_ellipsoid_holds_95_percent_of_the_errors_at_the_point_that_counts() -> None:
+    """Standard deviations of 0.2, 0.5 and 1 mm along the scanner's axes: 2.796 of each to either side."""
+    (error,) = shown(Marker.SPHERE)
+    pose = pose_from_message(PoseStamped(pose=error.pose))
+    np.testing.assert_allclose(pose.translation, POSE @ np.array(TARGET), atol=1e-9)
+    size = metres(error.scale)
+    shape = pose.rotation @ np.diag(size**2) @ pose.rotation.T
+    np.testing.assert_allclose(
+        shape, np.diag(np.array([0.2, 0.5, 1.0]) * 2 * 2.7955 / 1000) ** 2, rtol=1e-4, atol=1e-12
+    )
+
+
+def test_the_ellipsoid_of_a_turn_is_across_the_line_to_the_frames_origin() -> None:
+    """An error of the rotation about z alone moves the point along z x arm, by the arm's length across z."""
+    (error,) = shown(Marker.SPHERE, np.diag([0, 0, 0, 0, 0, 0.01**2]))
+    pose = pose_from_message(PoseStamped(pose=error.pose))
+    arm = POSE.rotation @ np.array(TARGET)
+    way = np.cross([0.0, 0.0, 1.0], arm)
+    size = metres(error.scale)
+    longest = int(size.argmax())
+    assert size[longest] == pytest.approx(2 * 2.7955 * 0.01 * np.linalg.norm(way) / 1000, rel=1e-4)
+    assert abs(pose.rotation[:, longest] @ way) == pytest.approx(float(np.linalg.norm(way)), rel=1e-6)
+
+
+def test_the_target_is_in_scanner_axes_as_it_came() -> None:
+    target = PointStamped(point=Point(x=0.01, y=-0.02, z=0.3))
+    found = markers_of(SLICE, [], HEADER, target).markers
+    (sphere,) = (one for one in found if one.ns == "target")
+    np.testing.assert_allclose(metres(sphere.pose.position), [0.01, -0.02, 0.3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -85,6 +86,35 @@ def test_says_the_same_as_without_a_guess() -> None:
         )
         # Far fewer poses could have been meant.
         assert guided.estimate.log10_false_alarms < alone.estimate.log10_false_alarms - 2
+
+
+@pytest.mark.parametrize("is_right", [True, False])
+def test_of_the_false_alarms_that_are_allowed_each_of_two_searches_gets_half(is_right: bool) -> None:
+    """A guess, right or wrong, must not have chance bring twice as much as was allowed."""
+    rng = np.random.default_rng(10)
+    truth = random_pose(rng, CUBE, SCANNER)
+    spots = np.concatenate([project(CUBE, truth, SCALE)[0], rng.uniform(50, 450, (4, 2))])
+    spots[:6] += rng.normal(0, 0.3, (6, 2))
+    guess = moved(rng, truth, 2.0, 1.0) if is_right else moved(rng, truth, 100.0, 90.0)
+    result = register_spots(spots, CUBE, SCALE, previous=guess)
+    assert result
+    alone = register_spots(spots, CUBE, SCALE)
+    assert alone
+    brought = result.estimate.log10_false_alarms
+    assert (brought < alone.estimate.log10_false_alarms - 2) is is_right
+
+    def is_accepted(allowed: float, previous: Pose | None) -> bool:
+        options = RegistrationOptions(max_log10_false_alarms=allowed)
+        found = register_spots(spots, CUBE, SCALE, options, previous=previous)
+        assert found or found.reason == "no_consensus"
+        return bool(found)
+
+    half = math.log10(2)
+    assert not is_accepted(brought + half - 0.01, guess)
+    assert is_accepted(brought + half + 0.01, guess)
+    # One search alone has them all.
+    assert not is_accepted(alone.estimate.log10_false_alarms - 0.01, None)
+    assert is_accepted(alone.estimate.log10_false_alarms + 0.01, None)
 
 
 def test_a_wrong_guess_does_no_harm() -> None:

@@ -1,0 +1,97 @@
+"""Storage over DICOM's network, in this process: associations one beside the other, objects one after the other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dicom_clients import send
+from dicom_files import write_slice
+from numpy.typing import NDArray
+
+from stereoreg_ros.dicom import read_slice
+from stereoreg_ros.reception.bounded_socket import Limits
+from stereoreg_ros.reception.intake import Intake
+from stereoreg_ros.reception.kept_objects import KeptObjects
+from stereoreg_ros.reception.slice_queue import SliceQueue
+from stereoreg_ros.reception.storage_service import StorageService
+
+SUCCESS, OUT_OF_RESOURCES = 0x0000, 0xA700
+MAX_OBJECT_BYTES = 2**20
+PATIENCE_S = 60.0
+IMAGE = np.arange(12 * 16, dtype=np.uint16).reshape(12, 16)
+# Two of them and their headers are more than one object may have.
+LARGE: NDArray[np.uint16] = np.zeros((512, 520), np.uint16)
+
+
+@contextmanager
+def storage(queue: SliceQueue, kept: KeptObjects | None = None) -> Iterator[int]:
+    """A running receiver that takes objects of a mebibyte; its port."""
+    limits = Limits(MAX_OBJECT_BYTES, 4, PATIENCE_S, PATIENCE_S)
+    intake = Intake(queue, MAX_OBJECT_BYTES)
+    service = StorageService("127.0.0.1", 0, "STEREOREG", (), None, limits, intake, kept)
+    service.start()
+    try:
+        yield service.port
+    finally:
+        service.stop()
+
+
+def test_one_after_the_other_in_an_association_each_object_may_be_as_large_as_is_allowed(tmp_path: Path) -> None:
+    queue = SliceQueue(10)
+    paths = [write_slice(tmp_path / f"{number}.dcm", LARGE + number) for number in range(5)]
+    with storage(queue) as port:
+        assert [one.Status for one in send(port, *paths)] == [SUCCESS] * 5
+    assert len(queue) == 5
+
+
+class WatchedLock:
+    """A lock that tells when somebody has to wait for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self.somebody_waits = threading.Event()
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            self.somebody_waits.set()
+            self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+def test_of_two_associations_that_store_one_uid_at_once_neither_overwrites_what_the_other_has_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both find no file of that name; what was acknowledged first must not be gone when the second is renamed."""
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    paths = [write_slice(tmp_path / f"{value}.dcm", IMAGE + value, SOPInstanceUID="1.2.3") for value in (1, 2)]
+    lock = WatchedLock()
+    with monkeypatch.context() as patched:
+        patched.setattr(threading, "Lock", lambda: lock)
+        kept = KeptObjects(folder)
+    writing = threading.Semaphore(0)
+    real_write = KeptObjects._write
+
+    def write(self: KeptObjects, file: Path, content: bytes) -> None:
+        # The first to write goes on once the second is there too: it waits for the lock, or writes as well.
+        if writing.acquire(blocking=False):
+            lock.somebody_waits.set()
+        else:
+            writing.release()
+        assert lock.somebody_waits.wait(PATIENCE_S)
+        real_write(self, file, content)
+
+    monkeypatch.setattr(KeptObjects, "_write", write)
+    with storage(SliceQueue(10), kept) as port, ThreadPoolExecutor(2) as clients:
+        responses = list(clients.map(lambda path: send(port, path)[0].Status, paths))
+    assert responses == [SUCCESS, SUCCESS]
+    assert {one.name for one in folder.iterdir()} == {"1.2.3.dcm", "1.2.3_2.dcm"}
+    assert {int(read_slice(one).ct_slice.hu[0, 0]) + 1024 for one in folder.iterdir()} == {1, 2}
