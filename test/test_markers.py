@@ -76,7 +76,7 @@ def test_of_a_refused_frame_nothing_is_shown_but_the_slice() -> None:
 
 
 def test_the_plane_goes_around_the_pixels_from_their_outer_edges() -> None:
-    """20 columns of 0.5 mm along y of the scanner, 30 rows of 2 mm against its x, each 0.1 mm aside of the one before."""
+    """20 columns of 0.5 mm along y of the scanner, 30 rows of 2 mm against its x, each 0.1 mm aside of the last."""
     (plane,) = shown(Marker.LINE_STRIP)
     left, top, right, bottom = -0.5, -0.5, 19.5, 29.5
     corners_px = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
