@@ -1,0 +1,1 @@
+"""Small bugs, put into a copy of the code one at a time: whether the tests notice."""
