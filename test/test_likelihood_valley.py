@@ -68,6 +68,21 @@ def test_errors_that_spots_share_widen_it():
     assert np.linalg.eigvalsh(covariance - without)[-1] > 0.2 * np.linalg.eigvalsh(without)[-1]
 
 
+def test_each_rod_has_its_own_spot_weight_and_errors():
+    """Five of six rods, in an order of their own, and no two known alike."""
+    frame, pose = load_frame("cube6"), Pose(np.eye(3), np.array([40.0, 50.0, 4.0]))
+    rng = np.random.default_rng(5)
+    lines = np.array([4, 0, 3, 2, 5])
+    spots_mm = SCALE.to_mm(project(frame, pose, SCALE)[0])
+    whitening = np.tril(rng.uniform(50.0, 400.0, (6, 2, 2)))
+    common = rng.normal(0.0, 0.005, (6, 2, 3))
+    used = np.isin(np.arange(6), lines)[None]
+    rotations, translations = pose.rotation[None], pose.translation[None]
+    found = refine(frame, rotations, translations, spots_mm[None], used, whitening[None], 100, common[None])
+    covariance = covariance_along_valley(frame, pose, lines, spots_mm[lines], whitening[lines], common[lines])
+    np.testing.assert_allclose(np.linalg.eigvals(covariance @ found.information[0]).real, 1.0, atol=0.02)
+
+
 def test_of_four_rods_it_is_the_mean_squared_error():
     """Over even poses, as it supposes. The inverse of the information holds no more than the bottom of the valley."""
     along, at_bottom = [], []

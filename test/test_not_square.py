@@ -28,6 +28,7 @@ from stereoreg_ros.simulation import (
     random_spot_set,
     render_slice,
 )
+from stereoreg_ros.simulation.mistakes import NO_ROD, Surroundings, true_scene, wrong_spacing
 from stereoreg_ros.simulation.patient import AIR_HU, background
 from stereoreg_ros.simulation.scene import BLOCK_HU
 from stereoreg_ros.spots import FoundSpots, find_spots
@@ -279,6 +280,25 @@ class TestSimulator:
         spots = random_spot_set(np.random.default_rng(6), cube, SpotSetSettings(SCANNER, 6, 200, 0.0)).spots_px
         assert (spots <= [COLUMNS, ROWS]).all()
         assert (spots.max(axis=0) > [COLUMNS - 10, ROWS - 10]).all()
+
+    def test_scenes_have_false_spots_over_the_whole_image_and_its_area(self, cube: Frame) -> None:
+        rng = np.random.default_rng(10)
+        scenes = [true_scene(rng, cube, Surroundings(SCANNER, 30.0), most_false=15) for _ in range(12)]
+        false = np.concatenate([scene.spots_px[scene.rods == NO_ROD] for scene in scenes])
+        assert (false <= [COLUMNS, ROWS]).all()
+        assert (false.max(axis=0) > [COLUMNS - 15, ROWS - 15]).all()
+        for scene in scenes:
+            assert scene.slice_area_mm2 == pytest.approx(ROWS * COLUMNS * 0.5 * 0.65)
+        # A scale that is configured wrong makes the area another one.
+        scene = wrong_spacing(rng, cube, Surroundings(SCANNER, 30.0), share=0.1)
+        assert scene.scale.shear == pytest.approx(SCALE.shear)
+        assert scene.slice_area_mm2 == pytest.approx(ROWS * COLUMNS * scene.scale.sx * scene.scale.sy)
+        factors = sorted([scene.scale.sx / SCALE.sx, scene.scale.sy / SCALE.sy])
+        # Where the image shows the middle of the frame, it is at that scale.
+        assert scene.truth is not None
+        shown = project(cube, scene.truth, scene.scale)[0][scene.rods]
+        assert np.linalg.norm((scene.spots_px - shown).mean(axis=0)) < 2.0
+        assert factors in (pytest.approx([1.0, 1.1]), pytest.approx([0.9, 1.0]))
 
     def test_a_spot_set_is_of_rods_in_its_own_pixels(self, cube: Frame) -> None:
         drawn = random_spot_set(np.random.default_rng(7), cube, SpotSetSettings(SCANNER, 6, 0, 0.0))

@@ -16,6 +16,7 @@ from rcl_interfaces.msg import SetParametersResult
 from std_srvs.srv import Trigger
 
 from stereoreg_ros import PixelScale, RegistrationOptions
+from stereoreg_ros.calibration import Sighting
 from stereoreg_ros.calibration_file import CalibrationRecord, save_calibration
 from stereoreg_ros.nodes.scale_keeper import ScaleKeeper
 from stereoreg_ros.options import CalibrationOptions
@@ -103,6 +104,17 @@ def test_told_and_measured_and_gone_back_on(tmp_path: Path) -> None:
     assert response.message == "pixel_spacing is the configured one, [0.4, 0.6] mm/pixel"
     assert (stand.settings.scale, keeper.source, keeper.covariance) == (TOLD, "configured", None)
     assert not path.exists()
+
+
+def test_the_last_slices_are_kept_however_many_they_may_be() -> None:
+    keeper = Stand(TOLD).keeper
+    slices = [Sighting(np.full((4, 2), float(k)), np.zeros((4, 2, 2))) for k in range(13)]
+    keeper.sightings.extend(slices[:12])
+    assert list(keeper.sightings) == slices[2:12]  # ten by default
+    keeper.keep_slices(3)
+    assert list(keeper.sightings) == slices[9:12]
+    keeper.sightings.append(slices[12])
+    assert list(keeper.sightings) == slices[10:]
 
 
 def test_the_same_scale_told_again_is_no_change() -> None:

@@ -166,6 +166,19 @@ def test_of_two_that_want_the_same_spots_the_surer_has_them_in_any_order(scenes,
     assert twins_at_odds(ct_slice, [FIRST, part, SECOND]) == twins_at_odds(ct_slice, [SECOND, part, FIRST])[::-1]
 
 
+def test_each_is_looked_for_where_it_was_itself(scenes) -> None:
+    """Chance brings less near a guess; that of the other frame is none."""
+    ct_slice, first, second = scenes[3]
+    told = register_frames(ct_slice, [FIRST, SECOND], previous=[first, second])
+    swapped = register_frames(ct_slice, [FIRST, SECOND], previous=[second, first])
+    for one, other, frame, pose in zip(told, swapped, (FIRST, SECOND), (first, second), strict=True):
+        assert_right(one, frame, pose)
+        assert_right(other, frame, pose)
+        assert isinstance(one, Registration)
+        assert isinstance(other, Registration)
+        assert one.estimate.log10_false_alarms < other.estimate.log10_false_alarms - 3
+
+
 # Of (sx, sy, shear).
 SCALE_COVARIANCE = np.array([[4.0, 1.0, 0.6], [1.0, 9.0, -0.8], [0.6, -0.8, 2.0]]) * 1e-6
 

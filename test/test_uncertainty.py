@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from frames import cube_by_hand
 from numpy.typing import NDArray
 from scipy.stats import chi2, kstest
 
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
+from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.uncertainty import (
     ScaleMisfit,
     Whitened,
     checked_scale_covariance,
+    cramer_rao_pose,
     enclosing_covariance,
     error_ball_95,
     in_scanner_axes,
@@ -103,6 +107,21 @@ class TestPointCovariance:
         pose = Pose(rotation_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([5.0, 6.0, 7.0]))
         moved = point_covariance(covariance, pose, np.array([100.0, 0.0, 0.0]))
         np.testing.assert_allclose(moved, np.diag([1.0, 0.0, 0.0]), atol=1e-12)
+
+
+class TestCramerRao:
+    def test_is_that_of_the_given_rods_in_oblong_pixels(self) -> None:
+        frame, scale = cube_by_hand(), PixelScale(0.4, 0.7, 0.05)
+        pose = Pose(rotation_exp(np.array([0.1, -0.2, 0.7])), np.array([60.0, 80.0, 5.0]))
+        lines = np.array([5, 1, 3, 4])
+        columns = []
+        for axis in range(6):
+            step = 1e-5 * np.eye(6)[axis]
+            there, back = (project(frame, pose.perturbed(s * step[:3], s * step[3:]), scale)[0] for s in (1, -1))
+            columns.append((there - back)[lines].ravel() / 2e-5)
+        jacobian = np.stack(columns, axis=-1)
+        expected = 0.3**2 * np.linalg.inv(jacobian.T @ jacobian)
+        np.testing.assert_allclose(cramer_rao_pose(frame, lines, pose, scale, 0.3), expected, rtol=1e-4, atol=1e-9)
 
 
 class TestScannerAxes:

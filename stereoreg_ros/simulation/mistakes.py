@@ -123,11 +123,11 @@ def wrong_spacing(
     factors = np.ones(2)
     factors[rng.integers(2)] += share * rng.choice([-1, 1])
     true_scale = around.scanner.scale
-    scale = PixelScale(true_scale.sx * factors[0], true_scale.sy * factors[1])
+    scale = replace(true_scale, sx=true_scale.sx * factors[0], sy=true_scale.sy * factors[1])
     pose = _pose_within_prior(rng, frame, around)
     spots, rods = _spots(rng, frame, pose, true_scale)
     middle_mm = pose @ _middle(frame)
-    shift = np.append((factors - 1) * middle_mm[:2], 0.0)
+    shift = np.append(scale.to_mm(true_scale.to_px(middle_mm[:2])) - middle_mm[:2], 0.0)
     seen = Pose(pose.rotation, pose.translation + shift)
     return _scene(rng, spots, rods, _none(), frame, around, seen, frame, scale=scale)
 
@@ -141,7 +141,7 @@ def scale_within_tolerance(
     """
     factors = 1 + rng.normal(0.0, std, 2)
     true_scale = around.scanner.scale
-    scale = PixelScale(true_scale.sx * factors[0], true_scale.sy * factors[1])
+    scale = replace(true_scale, sx=true_scale.sx * factors[0], sy=true_scale.sy * factors[1])
     pose = _pose_within_prior(rng, frame, around)
     true_frame = with_rod_ends_off(rng, frame, rod_ends_mm) if rod_ends_mm else frame
     spots, rods = _spots(rng, true_frame, pose, true_scale)
