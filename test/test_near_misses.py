@@ -150,6 +150,16 @@ class TestNearMisses:
         expected = max(math.log(anywhere * AREA_MM2) + MISSING_COST, 0.0)
         assert near_misses(explanation(list(self.FIVE)), given, frame()) == pytest.approx(expected, rel=1e-9)
 
+    def test_of_an_upright_rod_there_is_no_way(self) -> None:
+        """A spot far away is none of its own."""
+        slopes = SLOPES.copy()
+        slopes[3] = 0.0
+        given = spots([*self.MATCHED, PLACES[3] + [-40.0, 25.0]])
+        assert near_misses(explanation(list(self.FIVE)), given, frame(slopes)) == 0.0
+        near = spots([*self.MATCHED, PLACES[3] + [1.0, 0.0]])
+        expected = math.log(0.5 * (9 / 8) ** -2 / (8 * math.pi) * AREA_MM2) + MISSING_COST
+        assert near_misses(explanation(list(self.FIVE)), near, frame(slopes)) == pytest.approx(expected, rel=1e-6)
+
     def test_of_a_rod_that_need_not_show_there_is_no_cost(self) -> None:
         """Cut a millimetre before its end: that it has no spot is nothing strange."""
         rods = frame(high_mm=[30, 30, 30, 1.0, 30, 30])
