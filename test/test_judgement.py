@@ -297,6 +297,12 @@ class TestNearMisses:
             assert ("those matched do not fit well" in verdict.message) == bool(reason)
 
 
+@pytest.mark.parametrize(("probability", "evidence"), [(0.4, 0.0), (0.05, math.log(2.456)), (0.001, math.log(53.26))])
+def test_what_a_small_probability_says_at_most(probability: float, evidence: float) -> None:
+    """Sellke, Bayarri and Berger 2001: one over -e p log p; of 0.05 that is odds of five to two, no more."""
+    assert judgement._evidence(probability) == pytest.approx(evidence, abs=1e-3)
+
+
 class TestPrecision:
     @pytest.mark.parametrize(("degrees", "reason"), [(1.01, "degenerate"), (0.99, None)])
     def test_a_rotation_that_is_open_is_named(self, degrees: float, reason: str | None) -> None:
