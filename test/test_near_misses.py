@@ -252,14 +252,16 @@ class TestRivals:
         others = {rare: -9.0 + 0.99 * self.APART, common: -9.0 + 1.01 * self.APART}
         assert self.rivals(monkeypatch, explanation(self.SIX), others) == [rare]
 
-    def test_spots_in_order_with_false_ones_say_less(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Ten times as dense, each by a decade: of the best one's six spots the rival has five."""
+    @pytest.mark.parametrize(("times", "is_rival"), [(1.0, False), (10.0, True)])
+    def test_spots_in_order_with_false_ones_say_less(
+        self, monkeypatch: pytest.MonkeyPatch, times: float, is_rival: bool
+    ) -> None:
+        """So many times as dense, by which each counts less: of the best one's six spots the rival has five."""
         another = explanation([0, 1, 2, 3, 4, 6], 1.0 + 2 * 3.5 * math.log(10))
-        unordered = {another: 5.0}
-        assert self.rivals(monkeypatch, explanation(self.SIX), unordered) == []
-        ordered = np.full(6, 10.0)
-        monkeypatch.setattr(consensus, "_densities", lambda *_, in_order=True: ordered if in_order else ordered / 10)
-        assert self.rivals(monkeypatch, explanation(self.SIX), {another: 5.0}) == [another]
+        dense = np.full(6, 0.5)
+        monkeypatch.setattr(consensus, "_densities", lambda *_, in_order=True: times * dense if in_order else dense)
+        found = self.rivals(monkeypatch, explanation(self.SIX), {another: 5.0})
+        assert found == ([another] if is_rival else [])
 
     def test_nothing_found_has_no_rivals(self) -> None:
         assert judged([], self.spots, frame(), self.PRIOR, self.APART) == []
