@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from dicom_files import write_enhanced_ct, write_slice
 from pydicom.uid import CTImageStorage, MRImageStorage
 
 from stereoreg_ros.dicom import DicomError, read_frames, read_series, read_slice
+from stereoreg_ros.dicom.codestream import CodestreamSize, require_rle_size, size_of
 from stereoreg_ros.reception.intake import Intake, ObjectRefusedError
 from stereoreg_ros.reception.slice_queue import SliceQueue
 
@@ -65,6 +67,50 @@ class TestAxes:
             return
         rotation = read_slice(path).ct_slice.scanner_from_slice.rotation
         np.testing.assert_allclose(rotation, [[0, 0, -1], [1, 0, 0], [0, -1, 0]], atol=1e-3)
+
+
+class TestCompressedSize:
+    """What a compressed image says of its size, byte by byte."""
+
+    JPEG_FRAME = struct.pack(">BBHBHHB", 0xFF, 0xC3, 11, 16, 60, 70, 1) + bytes(3)
+    JPEG_TABLE = b"\xff\xc4" + struct.pack(">H", 6) + b"\x10\xff\xc0\x00"
+
+    def test_of_jpeg_2000_without_the_offset_of_the_image_and_whatever_its_tiles(self) -> None:
+        image = struct.pack(">HH8IH", 41, 0, 100, 80, 30, 20, 64, 48, 5, 6, 1)
+        assert size_of(b"\xff\x4f\xff\x51" + image) == CodestreamSize(60, 70, 1)
+
+    @pytest.mark.parametrize(
+        "before",
+        [b"", JPEG_TABLE, b"\xff\xff\xff", b"\xff\xd0\xff\x01", b"\xff\xcc\x00\x02", b"\xff\xc8\x00\x02"],
+        ids=["nothing", "a table with a marker in it", "fill bytes", "markers alone", "arithmetic coding", "reserved"],
+    )
+    def test_of_jpeg_behind_other_segments(self, before: bytes) -> None:
+        assert size_of(b"\xff\xd8" + before + self.JPEG_FRAME) == CodestreamSize(60, 70, 1)
+
+    @pytest.mark.parametrize(
+        ("packets", "is_taken"),
+        [
+            # Twice the pixels, and 256 bytes that do no harm.
+            (b"\x81\x00" * 4, True),
+            (b"\x81\x00" * 5, False),
+            (bytes([127]) + bytes(128), True),
+            (b"\x80" * 456, True),
+            (b"\x80" * 458, False),
+        ],
+        ids=["runs", "too many runs", "as it is", "nothing", "too much nothing"],
+    )
+    def test_of_an_rle_segment_by_what_it_unpacks_to(self, packets: bytes, is_taken: bool) -> None:
+        codestream = struct.pack("<16I", 1, 64, *[0] * 14) + packets
+        if is_taken:
+            require_rle_size(codestream, 100)
+        else:
+            with pytest.raises(ValueError, match="unpacks to more than twice the 100 bytes of 100 pixels"):
+                require_rle_size(codestream, 100)
+
+    @pytest.mark.parametrize("count", [0, 16])
+    def test_of_an_rle_image_with_as_many_segments_as_it_cannot_have(self, count: int) -> None:
+        with pytest.raises(ValueError, match=f"has {count} segments, expected 1 to 15"):
+            require_rle_size(struct.pack("<16I", count, *[64] * 15), 100)
 
 
 class TestSeries:

@@ -23,7 +23,7 @@ from stereoreg_ros.matching.visibility import may_show, must_show
 
 AREA_MM2 = 10_000.0
 # By which each rod leans: mm along x and y for one of height. The slice is z = 0 of the frame.
-SLOPES = np.array([[0.0, 0.1], [0.1, 0.0], [0.0, -0.1], [0.5, 0.0], [-0.1, 0.05], [0.05, 0.2]])
+SLOPES = np.array([[0.0, 0.1], [0.1, 0.0], [0.0, -0.1], [0.4, 0.3], [-0.1, 0.05], [0.05, 0.2]])
 PLACES = np.array([[0.0, 0.0], [60.0, 0.0], [0.0, 60.0], [60.0, 70.0], [30.0, 35.0], [80.0, 40.0]])
 LOW_MM, HIGH_MM = -20.0, 30.0
 
@@ -134,19 +134,18 @@ class TestNearMisses:
 
     @pytest.mark.parametrize("away", [(1.0, 0.5), (-3.0, 1.0), (12.0, -2.0), (-9.0, 1.0), (3.0, 4.0)])
     def test_of_a_spot_beside_the_place_of_a_rod_that_has_none(self, away: tuple[float, float]) -> None:
-        """The fourth rod leans by 0.5 along x: its spot goes 10 mm to the one side and 15 mm to the other."""
+        """The fourth rod leans by 0.5: its spot goes 10 mm to the one side and 15 mm to the other."""
         given = spots([*self.MATCHED, PLACES[3] + away])
         clutter = 1 / AREA_MM2
         expected = math.log(self.density(away, SLOPES[3]) / clutter) + MISSING_COST
         assert expected > 1
         found = near_misses(explanation(list(self.FIVE)), given, frame())
-        # Along the way the lean of the rod in space, not in the slice, is what its length is.
         assert found == pytest.approx(expected, rel=1e-9)
 
-    @pytest.mark.parametrize("away", [(-10.5, 0.0), (15.5, 0.0)])
-    def test_beyond_the_ends_of_that_way_only_nearness_counts(self, away: tuple[float, float]) -> None:
-        given = spots([*self.MATCHED, PLACES[3] + away])
-        anywhere = 0.5 * (1 + away[0] ** 2 / 8) ** -2 / (8 * math.pi)
+    @pytest.mark.parametrize("away_mm", [-10.5, 15.5])
+    def test_beyond_the_ends_of_that_way_only_nearness_counts(self, away_mm: float) -> None:
+        given = spots([*self.MATCHED, PLACES[3] + away_mm * np.array([0.8, 0.6])])
+        anywhere = 0.5 * (1 + away_mm**2 / 8) ** -2 / (8 * math.pi)
         expected = max(math.log(anywhere * AREA_MM2) + MISSING_COST, 0.0)
         assert near_misses(explanation(list(self.FIVE)), given, frame()) == pytest.approx(expected, rel=1e-9)
 
