@@ -28,6 +28,13 @@ def test_in_order_while_timely() -> None:
     assert (backlog.received, backlog.skipped, len(backlog)) == (5, 0, 0)
 
 
+def test_as_long_as_is_allowed_is_timely() -> None:
+    backlog = Backlog()
+    for image in numbered(3):
+        backlog.add(image, 100.0)
+    assert taken(backlog, 100.0 + MOST_WAIT_S) == [0, 1, 2]
+
+
 def test_newest_alone_once_one_has_waited_too_long() -> None:
     backlog = Backlog()
     for image in numbered(5):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
@@ -60,6 +61,25 @@ def test_two_poses_of_one_stamp_are_none():
     poses.add(Time(sec=1), pose(1.0))
     poses.add(Time(sec=1), pose(2.0))
     assert isinstance(poses.take(Time(sec=1)), MessageError)
+
+
+@pytest.mark.parametrize("third", [1.0, 2.0, 3.0])
+def test_a_third_pose_does_not_make_two_different_ones_one_again(third: float):
+    poses = slice_poses()
+    for x_mm in (1.0, 2.0, third):
+        poses.add(Time(sec=1), pose(x_mm))
+    assert isinstance(poses.take(Time(sec=1)), MessageError)
+    # That is over when the image has been told.
+    poses.add(Time(sec=1), pose(4.0))
+    assert isinstance(poses.take(Time(sec=1)), Pose)
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_pose_and_one_that_cannot_be_read_are_none(is_first: bool):
+    poses, unreadable = slice_poses(), MessageError("cannot be read")
+    for one in (unreadable, pose(1.0)) if is_first else (pose(1.0), unreadable):
+        poses.add(Time(sec=1), one)
+    assert poses.take(Time(sec=1)) is unreadable
 
 
 def test_two_images_of_one_stamp_are_refused_a_pose_that_may_be_of_either():

@@ -265,6 +265,11 @@ class TestSeveralPoses:
         # The same matches twice: a turn is all that parts them.
         assert "nominal_orientation" in judged(estimate(), estimate(6, near)).message
 
+    def test_are_told_after_a_residual_that_cannot_be(self) -> None:
+        """Of poses none of which fits, it is no help to be told apart."""
+        turned = Pose(rotation_exp(np.array([0.0, 0.0, math.pi])), np.array([1.0, 2.0, 3.0]))
+        assert judged(replace(estimate(), chi_square=99.0), estimate(pose=turned)).reason == "inaccurate"
+
     def test_no_more_than_eight_are_listed(self) -> None:
         verdict = judged(*[estimate() for _ in range(11)])
         assert verdict.message.startswith("11 poses explain")
@@ -295,6 +300,18 @@ class TestNearMisses:
             verdict = judged(doubted, near_misses=near_misses)
             assert verdict.reason == reason
             assert ("those matched do not fit well" in verdict.message) == bool(reason)
+
+    def test_the_residual_and_what_another_scale_takes_from_it_are_one_witness(self) -> None:
+        scale, residual = ScaleMisfit(float(chi2.isf(0.3, 2)), 2, 0.002), float(chi2.isf(0.3, 6))
+        both = replace(estimate(), scale_misfit=scale, chi_square=residual)
+        assert judged(both, near_misses=judgement._MOST_EVIDENCE - 0.3).reason is None
+        assert judged(both, near_misses=judgement._MOST_EVIDENCE - 0.01).reason == "contradicted"
+
+
+@pytest.mark.parametrize(("probability", "evidence"), [(0.4, 0.0), (0.05, math.log(2.456)), (0.001, math.log(53.26))])
+def test_what_a_small_probability_says_at_most(probability: float, evidence: float) -> None:
+    """Sellke, Bayarri and Berger 2001: one over -e p log p; of 0.05 that is odds of five to two, no more."""
+    assert judgement._evidence(probability) == pytest.approx(evidence, abs=1e-3)
 
 
 class TestPrecision:

@@ -11,8 +11,9 @@ from stereoreg_ros.design.meeting import meetings
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.solvers import likelihood_valley
 from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
-from stereoreg_ros.solvers.maximum_likelihood import refine
+from stereoreg_ros.solvers.maximum_likelihood import Evaluated, refine
 
 SCALE = PixelScale(0.5, 0.5)
 ALL_SIX = np.arange(6)
@@ -144,6 +145,34 @@ def test_the_registration_states_it():
         _, information, _ = solved(frame, estimate.slice_from_frame, noisy[np.argsort(lines)], 0.3)
         ratios.append(np.trace(stated[3:, 3:]) / np.trace(np.linalg.inv(information)[3:, 3:]))
     assert max(ratios) > 1.5
+
+
+@pytest.mark.parametrize("narrowing", [0.0, 0.05, -0.05])
+def test_a_valley_whose_width_changes_counts_by_its_width(monkeypatch: pytest.MonkeyPatch, narrowing: float) -> None:
+    """By hand: along x 10 mm to either side; across it 0.5 mm of y, and narrower by exp(-k x).
+
+    What is left of the likelihood when y is integrated out is a Gaussian about x = -k a^2, and y^2 is exp(4 k^2 a^2)
+    times as large as in the middle.
+    """
+    a, b = 10.0, 0.5
+    known = np.array([np.nan, np.nan, 0.2, 1e-3, 2e-3, 3e-3])
+
+    def evaluate(
+        _frame: Frame, rotations: Array, translations: Array, _target: Array, _used: Array, *_: Array | None
+    ) -> Evaluated:
+        at = np.concatenate([translations, Rotation.from_matrix(rotations).as_rotvec()], axis=1)
+        precision = np.tile(known**-2, (len(at), 1))
+        precision[:, 0], precision[:, 1] = a**-2, b**-2 * np.exp(2 * narrowing * at[:, 0])
+        information = precision[:, :, None] * np.eye(6)
+        return Evaluated(rotations, translations, (precision * at**2).sum(axis=1), information, -precision * at)
+
+    monkeypatch.setattr(likelihood_valley, "evaluate", evaluate)
+    found = covariance_along_valley(four_rods(1), Pose.identity(), np.arange(4), np.zeros((4, 2)), np.zeros((4, 2, 2)))
+    tilt = (narrowing * a) ** 2
+    expected = [a**2 * (1 + tilt), b**2 * np.exp(4 * tilt), *known[2:] ** 2]
+    # The steps of the walk are short enough for two percent.
+    np.testing.assert_allclose(np.diag(found), expected, rtol=0.02)
+    np.testing.assert_allclose(found - np.diag(np.diag(found)), 0.0, atol=1e-6)
 
 
 def test_a_valley_without_an_end_gives_what_is_seen_of_it():

@@ -50,8 +50,8 @@ EVIDENCE_SLACK = 2.5
 _NEAR_MISS_MM = 2.0
 # So near to a spot of another rod a rod without one may be taken for it.
 SHARED_SPOT_MM = 5.0
-# By how much, rad, a wrong pose turns the way that a leaning rod's spot takes.
-_WAY_TURNED = 0.2
+# By how much, rad, a wrong pose turns the way that a leaning rod's spot takes; what leans less than this has none.
+_WAY_TURNED, _UPRIGHT = 0.2, 1e-6
 # What a rod that the slice must cut, and that has no spot, costs an explanation: one in twenty rods shows none.
 MISSING_COST = 3.0
 
@@ -105,7 +105,7 @@ def _near_miss_densities(spots_mm: Array, frame: Frame, cuts: Cuts, rods: NDArra
     along = np.einsum("ksi,ki->ks", off, unit)
     across = np.einsum("ksi,ki->ks", off, np.stack([-unit[:, 1], unit[:, 0]], axis=1))
     reach = run[:, None] * np.stack([frame.lambda_min - cuts.lambdas, frame.lambda_max - cuts.lambdas], axis=1)[rods]
-    on_way = (along >= reach[:, :1]) & (along <= reach[:, 1:])
+    on_way = (along >= reach[:, :1]) & (along <= reach[:, 1:]) & (run > _UPRIGHT)[:, None]
     # Where the pose is wrong, so is the direction of that way.
     scale = np.hypot(math.sqrt(2.0) * _NEAR_MISS_MM, _WAY_TURNED * along)
     beside = (1.0 + (across / scale) ** 2) ** -1.5 / (2 * scale)

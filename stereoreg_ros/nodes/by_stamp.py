@@ -54,15 +54,18 @@ class ByStamp(Generic[_Part, _Whole]):
                 part = MessageError(f"two images bear one stamp, expected one to tell whose {self._name} this is")
             return of_stamp[0].whole, part
         known = self._parts.get(key)
-        if self._differ(known, part):
+        if isinstance(known, MessageError):
+            # A third one does not tell which of two was right.
+            part = known
+        elif self._differ(known, part):
             part = MessageError(f"two different {self._name} messages bear the image's stamp, expected one")
         self._parts[key] = part
         while len(self._parts) > _CAPACITY:
             self._parts.popitem(last=False)
         return None
 
-    def _differ(self, known: _Part | MessageError | None, part: _Part | MessageError) -> bool:
-        if known is None or isinstance(known, MessageError) or isinstance(part, MessageError):
+    def _differ(self, known: _Part | None, part: _Part | MessageError) -> bool:
+        if known is None or isinstance(part, MessageError):
             return False
         return not self._same(known, part)
 

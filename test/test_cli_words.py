@@ -1,0 +1,265 @@
+"""What the commands say of results made by hand, and what they pass on: no two numbers are alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dicom_files import write_slice
+
+from stereoreg_ros import RegistrationOptions, cli, load_frame
+from stereoreg_ros.calibration import Calibration
+from stereoreg_ros.calibration_series import SeriesScale, SliceScale
+from stereoreg_ros.geometry.pose import Pose, rotation_exp
+from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.options import CalibrationOptions
+from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
+from stereoreg_ros.worst_case import WorstCase
+
+FRAME = load_frame("cube6")
+IMAGE = np.arange(6 * 8, dtype=np.uint16).reshape(6, 8)
+SCALE = PixelScale(0.4, 0.7)
+TURNED = Pose(rotation_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([1.25, -20.5, 300.0]))
+OTHER = Pose(rotation_exp(np.array([np.pi, 0.0, 0.0])), np.array([4.0, 5.0, 6.0]))
+
+
+def estimate(pose: Pose = TURNED, rods: int = 5, residual_mm: float = 0.25) -> PoseEstimate:
+    """Whose slice lies elsewhere, with spots in another order than the rods."""
+    matches = tuple(
+        Match(FRAME.line_names[row], row, rods - row, np.array([10.0 + row, 20.5]), np.array([10.0, 20.0]), residual_mm)
+        for row in range(rods)
+    )
+    return PoseEstimate(OTHER, pose, np.diag([0.01, 0.04, 0.09, 1e-6, 1e-6, 1e-6]), matches, 3.0, -9.5)
+
+
+def accepted(caution: str = "") -> Registration:
+    return Registration(FRAME, SCALE, RegistrationOptions(), np.zeros((9, 2)), estimate(), caution)
+
+
+def refused(reason: Reason, *estimates: PoseEstimate) -> Refusal:
+    return Refusal(FRAME, SCALE, np.zeros((9, 2)), reason, f"because it is {reason}", estimates)
+
+
+class Command:
+    """`stereoreg register` of slices with results that were made by hand."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._folder, self._capsys = folder, capsys
+        self.results: list[Registration | Refusal] = []
+        self.slices: list[Slice] = []
+        monkeypatch.setattr("stereoreg_ros.cli.register.register_slice", self._register)
+
+    def _register(self, ct_slice: Slice, *_: object) -> Registration | Refusal:
+        self.slices.append(ct_slice)
+        return self.results[len(self.slices) - 1]
+
+    def __call__(self, results: list[Registration | Refusal], *arguments: object, name: str = "slice") -> list[str]:
+        """Lines of the output."""
+        self.results, self.slices = results, []
+        paths = [
+            write_slice(self._folder / f"{name}{number}.dcm", IMAGE, PixelSpacing=[SCALE.sy, SCALE.sx])
+            for number in range(len(results))
+        ]
+        assert cli.main(["register", "--frame", "cube6", *map(str, [*arguments, *paths])]) == 0
+        return self._capsys.readouterr().out.splitlines()
+
+    def json(self, result: Registration | Refusal, *arguments: object) -> dict[str, Any]:
+        (line,) = self([result], "--json", *arguments)
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+
+def words(line: str) -> str:
+    """A line of a table without its columns."""
+    return " ".join(line.split())
+
+
+@pytest.fixture
+def register(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize(
+    ("flags", "scale"),
+    [
+        ([], PixelScale(0.4, 0.7)),
+        (["--pixel-shear", -0.02], PixelScale(0.4, 0.7, -0.02)),
+        (["--pixel-spacing", 0.9, 0.3], PixelScale(0.9, 0.3)),
+        (["--pixel-spacing", 0.9, 0.3, "--pixel-shear", 0.01], PixelScale(0.9, 0.3, 0.01)),
+    ],
+)
+def test_the_scale_is_the_files_unless_it_is_told(register: Command, flags: list[object], scale: PixelScale) -> None:
+    register([accepted()], *flags)
+    (ct_slice,) = register.slices
+    assert ct_slice.scale == scale
+    np.testing.assert_array_equal(ct_slice.hu, IMAGE - 1024.0)
+    np.testing.assert_array_equal(ct_slice.scanner_from_slice.translation, [-10.0, -20.0, 0.0])
+
+
+def test_an_accepted_slice_tells_the_pose_in_the_scanner_and_each_match(register: Command) -> None:
+    found = register.json(accepted())
+    assert found["scanner_from_frame"]["position_mm"] == [1.25, -20.5, 300.0]
+    assert found["scanner_from_frame"]["quaternion_xyzw"] == pytest.approx([0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+    assert found["matches"][1] == {"line": FRAME.line_names[1], "spot_px": [11.0, 20.5], "residual_mm": 0.25}
+    assert (found["spots"], found["lines"], found["inliers"], found["ambiguous_poses"]) == (9, 6, 5, 1)
+    assert (found["pixel_spacing_x_mm"], found["pixel_spacing_y_mm"]) == (0.4, 0.7)
+    assert (found["position_std_mm"], found["log10_false_alarms"]) == (pytest.approx(0.3), -9.5)
+    assert "caution" not in found
+    assert "alternatives" not in found
+    assert register.json(accepted("look twice"))["caution"] == "look twice"
+
+
+def test_an_ambiguous_slice_tells_every_pose_and_none_as_the_pose(register: Command) -> None:
+    found = register.json(refused("ambiguous", estimate(), estimate(OTHER, 4, 0.5)))
+    assert (found["scanner_from_frame"], found["matches"]) == (None, [])
+    first, second = found["alternatives"]
+    assert first["scanner_from_frame"]["position_mm"] == [1.25, -20.5, 300.0]
+    assert second["scanner_from_frame"]["position_mm"] == [4.0, 5.0, 6.0]
+    assert (first["inliers"], second["inliers"]) == (5, 4)
+    assert (first["residual_rms_mm"], second["residual_rms_mm"]) == (0.25, 0.5)
+    assert found["ambiguous_poses"] == 2
+
+
+@pytest.mark.parametrize("reason", ["no_consensus", "inaccurate"])
+def test_a_pose_that_is_not_to_be_believed_is_not_told_as_the_pose(register: Command, reason: Reason) -> None:
+    found = register.json(refused(reason, estimate()))
+    assert (found["outcome"], found["reason"], found["message"]) == ("refused", reason, f"because it is {reason}")
+    assert (found["scanner_from_frame"], found["matches"]) == (None, [])
+    assert "alternatives" not in found
+    # How good it looked is told.
+    assert (found["inliers"], found["residual_rms_mm"]) == (5, 0.25)
+
+
+def test_the_worst_case_is_told_in_its_order_and_null_where_there_is_none(
+    register: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bounds = WorstCase(0.3, 1.5, np.array([0.1, 0.2, 0.3]), np.array([4.0, 5.0, 6.0]))
+    asked: list[float] = []
+
+    def worst_case(_: Registration, max_spot_error_px: float) -> WorstCase | None:
+        asked.append(max_spot_error_px)
+        return bounds if max_spot_error_px < 1 else None
+
+    monkeypatch.setattr("stereoreg_ros.cli.register.worst_case", worst_case)
+    found = register.json(accepted(), "--max-spot-error", 0.3)
+    assert found["worst_case_target_error_mm"] == 1.5
+    assert found["worst_case_position_mm"] == [0.1, 0.2, 0.3]
+    assert found["worst_case_rotation_deg"] == [4.0, 5.0, 6.0]
+    found = register.json(accepted(), "--max-spot-error", 2)
+    assert found["worst_case_target_error_mm"] is found["worst_case_position_mm"] is None
+    assert asked == [0.3, 2.0]
+    found = register.json(refused("no_consensus", estimate()), "--max-spot-error", 0.3)
+    assert found["worst_case_target_error_mm"] is None
+    assert len(asked) == 2
+    # A spot may be off by nothing at all.
+    assert register.json(accepted(), "--max-spot-error", 0)["worst_case_target_error_mm"] == 1.5
+
+
+def test_the_table_and_its_sum(register: Command) -> None:
+    results: list[Registration | Refusal] = [
+        accepted(),
+        refused("ambiguous", estimate(OTHER, 4, 0.5), estimate()),
+        accepted("look twice"),
+        refused("no_consensus"),
+        refused("ambiguous", estimate()),
+    ]
+    _, first, second, third, fourth, _, total = register(results)
+    assert words(first) == "slice0.dcm accepted 5 of 6 0.25 mm 1.2, -20.5, 300.0 mm"
+    assert words(second) == "slice1.dcm ambiguous 4 of 6 0.50 mm because it is ambiguous"
+    assert third.endswith("1.2, -20.5, 300.0 mm; look twice")
+    assert words(fourth) == "slice3.dcm no_consensus because it is no_consensus"
+    assert total == "2 of 5 slices accepted, 3 refused (2 ambiguous, 1 no_consensus)"
+
+
+def test_of_a_long_name_the_end_is_shown(register: Command) -> None:
+    """Names of files mostly differ at their ends."""
+    line = register([accepted()], name="a-very-long-name-of-a-series-of-the-day-")[1]
+    assert line.startswith("...")
+    assert line[3:32] == "a-very-long-name-of-a-series-of-the-day-0.dcm"[-29:]
+    assert line[32:].startswith("  accepted")
+
+
+class TestCalibrate:
+    CALIBRATION = Calibration(
+        PixelScale(0.41, 0.69, 0.003),
+        PixelScale(0.4, 0.7),
+        (0.001, 0.002, 0.0005),
+        np.diag([1e-6, 4e-6, 2.5e-7]),
+        (0.0003, 0.0004, 0.0001),
+        3,
+        17,
+        0.9,
+        0.4,
+        (),
+        "pixel spacing changed",
+    )
+    ALONE = SliceScale("a-name.dcm", 5, PixelScale(0.42, 0.68), PixelScale(0.415, 0.685), (0.003, 0.004))
+
+    def call(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *flags: object) -> None:
+        """With what the series came to made by hand."""
+        self.given: tuple[RegistrationOptions, CalibrationOptions] | None = None
+
+        def scale_of_series(
+            slices: Any, _frame: Any, options: RegistrationOptions, calibration: CalibrationOptions, _tell: Any
+        ) -> SeriesScale:
+            self.given = options, calibration
+            self.names = [name for name, _ in slices]
+            return SeriesScale(SCALE, self.CALIBRATION, (self.ALONE,))
+
+        monkeypatch.setattr("stereoreg_ros.cli.calibrate.scale_of_series", scale_of_series)
+        path = write_slice(tmp_path / "one.dcm", IMAGE)
+        assert cli.main(["calibrate", "--frame", "cube6", *map(str, [*flags, path])]) == 0
+
+    def test_as_json(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.call(monkeypatch, tmp_path, "--json")
+        assert json.loads(capsys.readouterr().out) == {
+            "outcome": "accepted",
+            "message": "pixel spacing changed",
+            "given_pixel_spacing": [0.4, 0.7],
+            "pixel_spacing": [0.41, 0.69],
+            "pixel_shear": 0.003,
+            "standard_errors": [0.001, 0.002, 0.0005],
+            "frame_errors": [0.0003, 0.0004, 0.0001],
+            "residual_before_px": 0.9,
+            "residual_after_px": 0.4,
+            "slices": [
+                {
+                    "file": "a-name.dcm",
+                    "rods": 5,
+                    "linear": [0.42, 0.68],
+                    "newton_raphson": [0.415, 0.685],
+                    "standard_errors": [0.003, 0.004],
+                }
+            ],
+        }
+        assert self.names == ["one.dcm"]
+
+    def test_as_a_table(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        self.call(monkeypatch, tmp_path)
+        _, alone, outcome = capsys.readouterr().out.splitlines()
+        told = "a-name.dcm 5 0.4200, 0.6800 0.4150 +- 0.0030, 0.6850 +- 0.0040 +3.75, -2.14"
+        assert words(alone) == told
+        assert outcome == "pixel spacing changed"
+
+    def test_options_of_both_kinds_are_passed_on(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        flags = (
+            "--calibrate-shear",
+            "--calibration-max-change",
+            0.1,
+            "--calibration-slices",
+            7,
+            "--spot-noise-px",
+            0.2,
+        )
+        self.call(monkeypatch, tmp_path, *flags)
+        assert self.given == (
+            RegistrationOptions(spot_noise_px=0.2),
+            CalibrationOptions(calibration_slices=7, calibrate_shear=True, calibration_max_change=0.1),
+        )
+        self.call(monkeypatch, tmp_path)
+        assert self.given == (RegistrationOptions(), CalibrationOptions())
