@@ -141,6 +141,20 @@ class TestPieces:
             spots = np.concatenate([OWN, pieces, uniform(rng, false)])
             assert likeness_to_pieces(spots, SIX, AREA_MM2) > math.log(1000.0)
 
+    def test_by_hand(self) -> None:
+        """Two spots, at 3 mm and 20 mm from one matched one and far from another; any share of five may be pieces."""
+        own, others = np.array([[50.0, 50.0], [200.0, 200.0]]), np.array([[53.0, 50.0], [50.0, 70.0]])
+        student = [
+            (1 + squared / 8) ** -2 / (8 * math.pi) for squared in (9.0, 400.0, 147**2 + 150**2, 150**2 + 130**2)
+        ]
+        beside = [(student[0] + student[2]) / 2, (student[1] + student[3]) / 2]
+        likelihoods = [
+            math.prod(share * one + (1 - share) / AREA_MM2 for one in beside) * AREA_MM2**2
+            for share in (0.1, 0.3, 0.5, 0.7, 0.9)
+        ]
+        found = likeness_to_pieces(np.concatenate([own, others]), np.array([0, 1]), AREA_MM2)
+        assert found == pytest.approx(math.log(sum(likelihoods) / 5))
+
     def test_no_others_look_like_nothing(self) -> None:
         assert likeness_to_pieces(OWN, SIX, AREA_MM2) == 0.0
 

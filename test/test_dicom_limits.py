@@ -90,22 +90,22 @@ class TestCompressedSize:
     @pytest.mark.parametrize(
         ("packets", "is_taken"),
         [
-            # Twice the pixels, and 256 bytes that do no harm.
+            # Beyond twice the pixels and 256 bytes nothing more may come. A run is of 128.
             (b"\x81\x00" * 4, True),
             (b"\x81\x00" * 5, False),
             (bytes([127]) + bytes(128), True),
-            (b"\x80" * 456, True),
-            (b"\x80" * 458, False),
+            (b"\x80" * 511, True),
+            (b"\x80" * 512, False),
         ],
         ids=["runs", "too many runs", "as it is", "nothing", "too much nothing"],
     )
     def test_of_an_rle_segment_by_what_it_unpacks_to(self, packets: bytes, is_taken: bool) -> None:
         codestream = struct.pack("<16I", 1, 64, *[0] * 14) + packets
         if is_taken:
-            require_rle_size(codestream, 100)
+            require_rle_size(codestream, 127)
         else:
-            with pytest.raises(ValueError, match="unpacks to more than twice the 100 bytes of 100 pixels"):
-                require_rle_size(codestream, 100)
+            with pytest.raises(ValueError, match="unpacks to more than twice the 127 bytes of 127 pixels"):
+                require_rle_size(codestream, 127)
 
     @pytest.mark.parametrize("count", [0, 16])
     def test_of_an_rle_image_with_as_many_segments_as_it_cannot_have(self, count: int) -> None:

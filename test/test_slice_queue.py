@@ -73,6 +73,16 @@ def test_pixels_are_bounded_as_well(slices, monkeypatch):
     put(queue, slices[3:4])
 
 
+def test_what_failed_to_be_stored_leaves_the_room_of_its_pixels(slices, monkeypatch):
+    monkeypatch.setattr(slice_queue, "MAX_BYTES", 3 * PIXELS.size * np.float32().nbytes)
+    queue = SliceQueue(100)
+    for _ in range(2):
+        with pytest.raises(OSError, match="disk"), queue.room_for(slices[:3]):
+            raise OSError("disk")
+    put(queue, slices[:3])
+    assert len(queue) == 3
+
+
 def test_a_closed_queue_takes_nothing(slices):
     queue = SliceQueue(10)
     put(queue, slices[:1])

@@ -92,6 +92,18 @@ def test_a_rod_that_ends_within_the_slice_may_leave_a_shorter_streak(share: floa
     assert longest == pytest.approx(allowed_lengths(thick(1.0), leaning(45.0), 8.0)[1])
 
 
+@pytest.mark.parametrize(("from_end_mm", "is_whole"), [(5.6, False), (5.7, True)])
+@pytest.mark.parametrize("is_lower", [True, False])
+def test_a_rod_ends_within_the_slice_up_to_half_its_thickness_along_the_rod(
+    from_end_mm: float, is_whole: bool, is_lower: bool
+) -> None:
+    """Of 8 mm at 45 degrees these are 5.657 mm."""
+    frame = load_frame("leksell_ct")
+    share = from_end_mm / float(np.linalg.norm(frame.ends[0] - frame.starts[0]))
+    shortest, _ = allowed_lengths(thick(1.0), cut_at(share if is_lower else 1 - share, 45.0), 8.0)
+    assert (shortest > 2.0) == is_whole
+
+
 @pytest.mark.parametrize("threshold", [2000.0, "auto"])
 @pytest.mark.parametrize("thickness_mm", [1.0, 3.0, 5.0])
 def test_no_rod_is_lost_where_the_thickness_is_known(thickness_mm: float, threshold: float | str) -> None:

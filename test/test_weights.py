@@ -17,7 +17,7 @@ from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.registration import recognise_spots
 from stereoreg_ros.solvers.tolerant_calibration import calibrate_tolerantly
 
-SCALE = PixelScale(0.45, 0.6, 0.03)
+SCALE = PixelScale(0.45, 0.6, 0.12)
 PLANE = Pose(rotation_exp(np.array([0.3, -0.8, 0.5])), np.array([5.0, 60.0, 70.0]))
 TRUTH = Pose(rotation_exp(np.array([0.1, -0.15, 0.8])), np.array([70.0, 120.0, 3.0]))
 MISSING = 1
