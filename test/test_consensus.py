@@ -74,6 +74,16 @@ class TestDistinct:
         (found,) = distinct([best, again], GAINS)
         assert found is best
 
+    @pytest.mark.parametrize(("squared", "is_the_same"), [(0.09, True), (0.11, False)])
+    def test_optima_are_the_same_within_a_third_of_a_standard_deviation(
+        self, squared: float, is_the_same: bool
+    ) -> None:
+        offset = np.array([0.0, math.sqrt(squared * COVARIANCE[1, 1]), 0.0, 0.0, 0.0, 0.0])
+        best = explanation()
+        (found,) = distinct([best, explanation(offset)], GAINS)
+        assert (found is best) is is_the_same
+        assert found.is_widened is not is_the_same
+
     @pytest.mark.parametrize("behind", [0.0, 1.0, 3.0])
     def test_two_optima_of_one_valley_are_one_whose_covariance_holds_both(self, behind: float) -> None:
         """As a mixture of the two, each by its likelihood, varies about the better one."""

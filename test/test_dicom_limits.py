@@ -15,7 +15,8 @@ from pydicom.uid import CTImageStorage, MRImageStorage
 
 from stereoreg_ros.dicom import DicomError, read_frames, read_series, read_slice
 from stereoreg_ros.dicom.codestream import CodestreamSize, require_rle_size, size_of
-from stereoreg_ros.reception.intake import Intake, ObjectRefusedError
+from stereoreg_ros.reception.intake import OUT_OF_RESOURCES, Intake, ObjectRefusedError
+from stereoreg_ros.reception.kept_objects import KeptObjects
 from stereoreg_ros.reception.slice_queue import SliceQueue
 
 IMAGE = np.arange(6 * 8, dtype=np.uint16).reshape(6, 8)
@@ -224,6 +225,29 @@ class TestIntake:
             with pytest.raises(ObjectRefusedError, match=r"Pixel Spacing \(0028,0030\) is .*, expected 0.001 to 100"):
                 Intake(queue, MAX_BYTES).take(Path("it"), content)
         assert len(queue) == int(is_taken)
+
+    def test_what_is_to_be_kept_is_kept_before_anybody_gets_it_and_not_given_where_it_cannot_be(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        content = write_slice(tmp_path / "a.dcm", IMAGE, SOPInstanceUID="1.2.3").read_bytes()
+        queue = SliceQueue(10)
+        folder = tmp_path / "kept"
+        kept = KeptObjects(folder)
+        with pytest.raises(ObjectRefusedError, match="cannot be kept: No such file or directory") as refused:
+            Intake(queue, MAX_BYTES).take(Path("it"), content, "1.2.3", kept)
+        assert refused.value.status == OUT_OF_RESOURCES
+        assert queue.first() is None
+        folder.mkdir()
+        real_keep = KeptObjects.keep
+
+        def keep(self: KeptObjects, uid: str, given: bytes) -> Path:
+            assert queue.first() is None
+            return real_keep(self, uid, given)
+
+        monkeypatch.setattr(KeptObjects, "keep", keep)
+        assert Intake(queue, MAX_BYTES).take(Path("it"), content, "1.2.3", kept) == 1
+        assert (folder / "1.2.3.dcm").read_bytes() == content
+        assert queue.first() is not None
 
     def test_of_many_frames_every_spacing_is_looked_at(self, tmp_path: Path) -> None:
         path = write_enhanced_ct(tmp_path / "a.dcm", [IMAGE, IMAGE], [5.0, -7.0])

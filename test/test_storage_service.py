@@ -50,6 +50,17 @@ def test_one_after_the_other_in_an_association_each_object_may_be_as_large_as_is
     assert len(queue) == 5
 
 
+def test_an_object_nearly_as_large_as_is_allowed_arrives_with_all_that_is_sent_around_it(tmp_path: Path) -> None:
+    """Its command, and twelve bytes for every sixteen thousand."""
+    rows = 64
+    small = write_slice(tmp_path / "small.dcm", np.zeros((rows, 1), np.uint16)).stat().st_size
+    columns = (MAX_OBJECT_BYTES - 200 - small) // (2 * rows) + 1
+    path = write_slice(tmp_path / "a.dcm", np.zeros((rows, columns), np.uint16))
+    assert MAX_OBJECT_BYTES - 400 < path.stat().st_size <= MAX_OBJECT_BYTES - 200
+    with storage(SliceQueue(10)) as port:
+        assert send(port, path)[0].Status == SUCCESS
+
+
 class WatchedLock:
     """A lock that tells when somebody has to wait for it."""
 

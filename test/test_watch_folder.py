@@ -194,3 +194,52 @@ def test_compressed_files_that_are_cut_short_are_never_taken(folder, tmp_path, s
     cut.write_bytes(content)
     watch.look()
     assert watch.look() == [1000]
+
+
+def test_a_file_as_large_as_is_allowed_is_taken_and_a_byte_more_is_not(folder, caplog):
+    for spare, expected in ((0, 1), (-1, 0)):
+        queue = SliceQueue(10)
+        name = folder / f"{spare}.dcm"
+        size = write_slice(folder.parent / "a.dcm", IMAGE).stat().st_size
+        watched = WatchedFolder(folder, 1.0, size + spare, Intake(queue, MAX_BYTES))
+        write_slice(name, IMAGE)
+        watched.look()
+        watched.look()
+        assert len(queue) == expected
+    assert f"left out {name}: has {size} bytes, expected {size - 1} at most" in caplog.text
+
+
+def test_a_file_that_is_replaced_as_it_is_opened_is_left_until_it_has_stayed(folder, monkeypatch):
+    """Of the same size, but not the one that was seen to be complete."""
+    watch = Watch(folder)
+    path = write_slice(folder / "a.dcm", IMAGE + 3, SOPInstanceUID="1.2.3")
+    real_opened = WatchedFolder._opened
+    replaced: list[Path] = []
+
+    def opened(self: WatchedFolder, name: Path) -> int:
+        if not replaced:
+            before = path.stat()
+            replaced.append(write_slice(path, IMAGE + 4, SOPInstanceUID="1.2.3"))
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 10**9))
+            assert path.stat().st_size == before.st_size
+        return real_opened(self, name)
+
+    monkeypatch.setattr(WatchedFolder, "_opened", opened)
+    assert watch.look() == []
+    assert watch.look() == []
+    assert replaced
+    assert watch.look() == []
+    assert watch.look() == [4]
+
+
+def test_folders_that_are_not_finished_are_left_alone(folder):
+    watch = Watch(folder)
+    for name in (".incoming", "done"):
+        (folder / name).mkdir()
+        write_slice(folder / name / "a.dcm", IMAGE + len(name))
+    assert watch.look() == []
+    assert watch.look() == [len("done")]
+    # Once it has its name, it is.
+    (folder / ".incoming").rename(folder / "incoming")
+    assert watch.look() == []
+    assert watch.look() == [len(".incoming")]
