@@ -8,6 +8,7 @@ BENCH_ARGS ?=
 MINUTES ?= 60
 INPUTS ?= 10000
 FUZZ_ARGS ?=
+MUTANTS_ARGS ?=
 MATRIX_TESTS ?=
 
 SHELL := bash
@@ -41,7 +42,7 @@ SOURCES := $(shell find stereoreg_ros config launch resource -name __pycache__ -
 WITH_ROS := export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST; \
             source install/setup.bash;
 
-.PHONY: help venv demo test colcon-test matrix docs lint bench soak fuzz catphan debian clean distclean
+.PHONY: help venv demo test colcon-test matrix docs lint bench soak fuzz mutants catphan debian clean distclean
 
 help:
 	@echo 'make venv       set up .venv (Python, ROS 2 wheels, tools) and build the package to install/'
@@ -54,6 +55,7 @@ help:
 	@echo 'make bench      measurements'
 	@echo 'make soak       slices at 20 Hz for MINUTES=$(MINUTES): what is lost, whether memory or latency grows; build/soak/soak.png'
 	@echo 'make fuzz       hostile input of every kind; INPUTS=$(INPUTS) of each, FUZZ_ARGS="frame dicom --seed 1" to choose'
+	@echo 'make mutants    bugs put into a copy of the code, one at a time: whether the tests notice; MUTANTS_ARGS="--quick" or words'
 	@echo 'make clean      remove what was built; make distclean: .venv and downloads too'
 	@echo 'PYTHON=python3.12 make venv   chooses the Python of a new .venv'
 
@@ -132,6 +134,10 @@ soak: venv
 fuzz: venv
 	export AMENT_PREFIX_PATH='$(CURDIR)/.venv' ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST OPENBLAS_NUM_THREADS=1; \
 	    .venv/bin/python -m fuzzing $(FUZZ_ARGS) --inputs $(INPUTS)
+
+# Nothing of it stays: the copies are made in a temporary folder.
+mutants: $(INSTALLED)
+	.venv/bin/python -m mutants $(MUTANTS_ARGS)
 
 clean:
 	rm -rf build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

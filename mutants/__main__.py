@@ -17,7 +17,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from mutants.bug import Bug, BugListError, read_bugs
-from mutants.copy import REPOSITORY, Copy, TestRun, TestsNotRunError
+from mutants.copy import REPOSITORY, Copy, TestRun, UnsoundTestsError
 
 
 def main() -> int:
@@ -34,7 +34,7 @@ def main() -> int:
         if not bugs:
             parser.error("no bug is so called")
         runs = try_all(bugs, arguments.workers)
-    except (BugListError, TestsNotRunError) as error:
+    except (BugListError, UnsoundTestsError) as error:
         print(f"mutants: {error}", file=sys.stderr)
         return 2
     table, wrong = described(bugs, runs)
@@ -49,7 +49,7 @@ def _is_chosen(bug: Bug, words: list[str], quick: bool) -> bool:
 def try_all(bugs: Sequence[Bug], workers: int, repository: Path = REPOSITORY) -> list[TestRun]:
     """What the tests of each bug came to, in so many copies of a repository at once; nothing of them is left behind.
 
-    Raises TestsNotRunError where a test fails without a bug, BugListError where a bug does not fit the code.
+    Raises UnsoundTestsError where a test fails without a bug, BugListError where a bug does not fit the code.
     """
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(workers) as pool:
         copies: queue.SimpleQueue[Copy] = queue.SimpleQueue()
@@ -81,7 +81,7 @@ def try_all(bugs: Sequence[Bug], workers: int, repository: Path = REPOSITORY) ->
         with bar:
             for run in pool.map(sound, selections):
                 if run.failed:
-                    raise TestsNotRunError(f"{run.failed} fails without a bug:\n{run.output}")
+                    raise UnsoundTestsError(f"{run.failed} fails without a bug:\n{run.output}")
             return list(pool.map(with_bug, bugs))
 
 

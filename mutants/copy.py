@@ -21,7 +21,7 @@ HUNG = "(hung)"
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 
 
-class TestsNotRunError(RuntimeError):
+class UnsoundTestsError(RuntimeError):
     """Tests were not found, or fail without any bug."""
 
 
@@ -60,7 +60,7 @@ class Copy:
             (folder / "shared").symlink_to(shared.resolve())
 
     def test(self, tests: Iterable[str], limit_s: float | None = LIMIT_S) -> TestRun:
-        """Run tests until the first that fails. Raises TestsNotRunError where pytest could not."""
+        """Run tests until the first that fails. Raises UnsoundTestsError where pytest could not."""
         environment = {
             **os.environ,
             "PYTHONPATH": str(self.root),
@@ -94,8 +94,8 @@ class Copy:
             raise
         seconds = time.monotonic() - begun
         if process.returncode not in (0, 1, 2):
-            raise TestsNotRunError(f"pytest {' '.join(tests)} ended with status {process.returncode}:\n{output}")
+            raise UnsoundTestsError(f"pytest {' '.join(tests)} ended with status {process.returncode}:\n{output}")
         found = _FAILED.search(output)
         if process.returncode and not found:
-            raise TestsNotRunError(f"pytest {' '.join(tests)} failed without naming a test:\n{output}")
+            raise UnsoundTestsError(f"pytest {' '.join(tests)} failed without naming a test:\n{output}")
         return TestRun(found.group(1) if found else "", seconds, output)
