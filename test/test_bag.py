@@ -129,16 +129,23 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
         player = started("play_bag.py", str(bag))
         try:
 
-            def outcomes() -> dict[tuple[int, int], str]:
+            def outcomes() -> dict[tuple[int, int], tuple[str, str]]:
                 return {
-                    (array.header.stamp.sec, array.header.stamp.nanosec): status.values[0].value
+                    (array.header.stamp.sec, array.header.stamp.nanosec): (
+                        status.values[0].value,
+                        status.values[1].value,
+                    )
                     for array in diagnostics
                     for status in array.status
                     if status.name == STATUS_NAME
                 }
 
             client.wait_for(lambda: set(outcomes()) >= set(stamps), "the diagnostics of every slice", DEADLINE_S)
-            accepted_stamps = {stamp for stamp, pose in zip(stamps, expected, strict=True) if pose is not None}
+            # Played in real time: beside a dozen busy processes, slices come faster than they are registered.
+            skipped = {stamp for stamp, outcome in outcomes().items() if outcome == ("refused", "skipped")}
+            could = {stamp for stamp, pose in zip(stamps, expected, strict=True) if pose is not None}
+            accepted_stamps = could - skipped
+            assert accepted_stamps
             client.wait_for(lambda: len(poses) >= len(accepted_stamps), "the poses")
             assert player.wait(DEADLINE_S) == 0
 
@@ -157,8 +164,8 @@ def test_slices_from_a_bag_give_the_poses_of_the_slices(tmp_path, make_series, f
             print(f"--- output of print_poses.py\n{log.read_text()}---")
     found = {(one.header.stamp.sec, one.header.stamp.nanosec): pose_from_message(one) for one in poses}
     assert set(found) == accepted_stamps
-    assert {stamp for stamp, outcome in outcomes().items() if outcome == "accepted"} == accepted_stamps
+    assert {stamp for stamp, outcome in outcomes().items() if outcome == ("accepted", "")} == accepted_stamps
     for stamp, pose in zip(stamps, expected, strict=True):
-        if pose is not None:
+        if pose is not None and stamp in found:
             assert np.allclose(found[stamp].translation, pose.translation, atol=1e-6)
             assert np.allclose(found[stamp].rotation, pose.rotation, atol=1e-9)
