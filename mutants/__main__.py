@@ -47,7 +47,7 @@ def _is_chosen(bug: Bug, words: list[str], quick: bool) -> bool:
 
 
 def try_all(bugs: Sequence[Bug], workers: int, repository: Path = REPOSITORY) -> list[TestRun]:
-    """What the tests of each bug came to, in so many copies of a repository at once; nothing of them is left behind.
+    """Run each bug's tests with the bug in place, in `workers` temporary copies of the repository at once.
 
     Raises UnsoundTestsError where a test fails without a bug, BugListError where a bug does not fit the code.
     """

@@ -386,10 +386,8 @@ def _couples(registration: Registration | Recognition) -> tuple[NDArray[np.intp]
 
 
 def _covariances(result: Registration | Recognition | Refusal) -> Array:
-    if result.covariances_px2 is not None:
-        return result.covariances_px2
-    assert not isinstance(result, Recognition)  # which has them
-    return np.zeros((len(result.spots_px), 2, 2))
+    known = result.covariances_px2
+    return np.zeros((len(result.spots_px), 2, 2)) if known is None else known
 
 
 def _degenerate(frame: Frame, matched: Sequence[Registration | Recognition]) -> str:

@@ -211,7 +211,8 @@ def recognise_spots(
     found = three_line.match_most(spots, frame, prior, options)
     if not found:
         return None
-    return Recognition(scale, options, _estimate(found[0], False, spots, frame, seen), seen.covariances_px2)
+    estimate = _estimate(found[0], False, spots, frame, seen)
+    return Recognition(scale, options, seen.spots_px, estimate, seen.covariances_px2)
 
 
 def _given(

@@ -161,6 +161,7 @@ class Recognition:
 
     scale: PixelScale
     options: RegistrationOptions
+    spots_px: Array
     estimate: PoseEstimate
     covariances_px2: Array
 

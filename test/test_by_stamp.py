@@ -69,7 +69,7 @@ def test_a_third_pose_does_not_make_two_different_ones_one_again(third: float):
     for x_mm in (1.0, 2.0, third):
         poses.add(Time(sec=1), pose(x_mm))
     assert isinstance(poses.take(Time(sec=1)), MessageError)
-    # That is over when the image has been told.
+    # Once the image has had its answer, the stamp is free again.
     poses.add(Time(sec=1), pose(4.0))
     assert isinstance(poses.take(Time(sec=1)), Pose)
 

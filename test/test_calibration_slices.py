@@ -55,11 +55,11 @@ def seen(spots_px: Array, plane: Pose | None = None, stated: PixelScale | None =
 
 
 class TestPlane:
-    @pytest.mark.parametrize("told", [TRUE, PixelScale(1.06 * TRUE.sx, 0.95 * TRUE.sy)], ids=["right", "wrong"])
-    def test_how_the_frame_stands_is_said_of_the_scanner(self, cube: Frame, told: PixelScale) -> None:
+    @pytest.mark.parametrize("configured", [TRUE, PixelScale(1.06 * TRUE.sx, 0.95 * TRUE.sy)], ids=["right", "wrong"])
+    def test_the_nominal_orientation_is_relative_to_the_scanner(self, cube: Frame, configured: PixelScale) -> None:
         rng = np.random.default_rng(1)
         spots = [project(cube, pose, TRUE)[0] + rng.normal(0.0, 0.1, (6, 2)) for pose in tilted_poses(cube, 3)]
-        found = calibrate([seen(one, GANTRY) for one in spots], cube, told, UPRIGHT)
+        found = calibrate([seen(one, GANTRY) for one in spots], cube, configured, UPRIGHT)
         assert isinstance(found, Calibration), found.message
         assert found.slices == 3
         np.testing.assert_allclose([found.scale.sx, found.scale.sy], [TRUE.sx, TRUE.sy], rtol=0.01)

@@ -12,10 +12,10 @@ from benchmarks.clutter import THRESHOLDS, Clutter, count
 @pytest.mark.parametrize(
     ("clutter", "sets"),
     [
-        (Clutter("cube6", 10, 14, 90.0, 0.3, 0.0), 25),
-        (Clutter("zframe", 8, 12, 120.0, 0.3, 0.0), 25),
-        (Clutter("leksell_ct", 8, 12, 256.0, 0.3, 0.0), 25),
-        (Clutter("cube6", 8, 12, 256.0, 0.3, 0.0, tolerance_mm=0.5, scale_tolerance=0.005), 25),
+        (Clutter("cube6", 10, 14, 90.0, 0.3, 0.0), 60),
+        (Clutter("zframe", 8, 12, 120.0, 0.3, 0.0), 60),
+        (Clutter("leksell_ct", 8, 12, 256.0, 0.3, 0.0), 60),
+        (Clutter("cube6", 8, 12, 256.0, 0.3, 0.0, tolerance_mm=0.5, scale_tolerance=0.005), 60),
     ],
     ids=lambda value: f"{value.frame}, {value.tolerance_mm} mm" if isinstance(value, Clutter) else "",
 )

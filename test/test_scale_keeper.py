@@ -57,13 +57,13 @@ class Stand:
         before = self.settings.scale
         sx, sy = values["pixel_spacing"]
         self.settings.scale = PixelScale(sx, sy, values["pixel_shear"])
-        assert not self.keeper.told(before), "the keeper's own change is none"
+        assert not self.keeper.scale_was_set(before), "the keeper's own change is none"
         return SetParametersResult(successful=True)
 
     def tell(self, scale: PixelScale) -> bool:
         """As somebody sets the parameters; returns whether the scale in use is another now."""
         before, self.settings.scale = self.settings.scale, scale
-        return self.keeper.told(before)
+        return self.keeper.scale_was_set(before)
 
 
 @pytest.mark.parametrize("number", range(3), ids=["sx", "sy", "shear"])

@@ -55,7 +55,7 @@ class ByStamp(Generic[_Part, _Whole]):
             return of_stamp[0].whole, part
         known = self._parts.get(key)
         if isinstance(known, MessageError):
-            # A third one does not tell which of two was right.
+            # Nothing that comes later says which of two was right, or what could not be read.
             part = known
         elif self._differ(known, part):
             part = MessageError(f"two different {self._name} messages bear the image's stamp, expected one")

@@ -18,7 +18,7 @@ from stereoreg_ros.nodes.parameters import ParameterError
 
 # Deep enough that no slice of a stream is lost in a search of a second, and small enough not to hoard memory.
 QUEUE: Final = QoSProfile(depth=30)
-# Who comes late gets the last message, and no older one.
+# The last message is latched, and no older one.
 LATCHED: Final = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _OVERRIDDEN: Final = (
     QoSPolicyKind.DEPTH,

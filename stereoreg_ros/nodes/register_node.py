@@ -406,7 +406,7 @@ class RegisterNode(Node):
             self._use_frames()
             self._forget_slices()
         if names & {"pixel_spacing", "pixel_shear"}:
-            if self._scale.told(scale_before):
+            if self._scale.scale_was_set(scale_before):
                 self._forget_slices()
             elif self.settings.scale != scale_before:
                 # It was measured from slices that are there, which say the same as before; a pose of theirs does not.

@@ -72,7 +72,7 @@ class ScaleKeeper:
         ours, slices = ((one.sx, one.sy, one.shear) for one in (self._configured, spacing))
         return np.allclose(ours, slices, rtol=_SAME_SPACING, atol=_SAME_SPACING * spacing.sx)
 
-    def told(self, before: PixelScale | None) -> bool:
+    def scale_was_set(self, before: PixelScale | None) -> bool:
         """The scale's parameters were set; returns whether somebody else did, and the scale in use is another now."""
         if self._sets_it_itself:
             return False

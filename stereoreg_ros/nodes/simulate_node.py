@@ -32,7 +32,7 @@ POSE_GRACE_S: Final = 1.0
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02
 _QOS: Final = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
-# Kept for whoever comes late: to judge a slice one needs its truth.
+# Latched for late subscribers: to judge a slice one needs its truth.
 _TRUTH_QOS: Final = QoSProfile(
     depth=100, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 )
