@@ -180,6 +180,11 @@ class TestWorthMatching:
     def test_of_those_that_are_not_sure_the_bright_ones_are_kept(self) -> None:
         assert self.chosen([100.0, 90.0, 80.0, 70.0, 30.0, 10.0], noise_hu=10.0) == [100.0, 90.0, 80.0, 70.0, 30.0]
 
+    def test_one_that_is_far_brighter_makes_no_others_faint(self) -> None:
+        """As bright as the fourth brightest is meant, where four rods are sought."""
+        heights = [1000.0, 100.0, 90.0, 80.0, 70.0, 25.0]
+        assert self.chosen([*heights, 23.0], noise_hu=10.0) == heights
+
     def test_the_order_does_not_matter(self) -> None:
         heights = [70.0, 10.0, 90.0, 30.0, 100.0, 80.0]
         assert self.chosen(heights, noise_hu=10.0) == [100.0, 90.0, 80.0, 70.0, 30.0]
@@ -189,6 +194,16 @@ class TestWorthMatching:
         assert self.chosen(rods + balls) == rods
         pins = [3000.0] * 8
         assert self.chosen(pins + rods + balls) == pins + rods
+
+    def test_thirty_two_are_few(self) -> None:
+        """Of more, what is not sure is left out."""
+        sure, others = [160.0] * 4, [100.0] * 28
+        assert self.chosen(sure + others, noise_hu=10.0) == sure + others
+        assert self.chosen([*sure, *others, 100.0], noise_hu=10.0) == sure
+
+    def test_each_is_sure_by_the_noise_around_itself(self) -> None:
+        heights, noise = np.array([20.0, 100.0, 100.0, 100.0, 100.0, 21.0]), np.array([1.0, 10, 10, 10, 10, 10])
+        assert worth_matching(heights, noise, 4).tolist() == [True, True, True, True, True, False]
 
     def test_many_of_one_kind_are_kept_all(self) -> None:
         many = np.linspace(3000, 1500, 200).tolist()

@@ -116,6 +116,10 @@ class TestClumps:
         assert (found >= 3 / (math.pi * 6**2) / (24 / AREA_MM2) - 1e-9).all()
         assert ratios(pieces, in_order=False).max() < found.min()
 
+    def test_three_are_some(self) -> None:
+        """Three in six circles of 6 mm, where uniform spots would bring 0.03."""
+        np.testing.assert_allclose(ratios(OWN[:3] + 1.0), 3 / (6 * math.pi * 6**2) / (9 / AREA_MM2))
+
     def test_two_are_none(self) -> None:
         rng = np.random.default_rng(7)
         far = uniform(rng, 8)
@@ -182,6 +186,13 @@ class TestLines:
         assert np.linalg.norm(OWN[3] - OWN[0]) > 6 * 5.5 + 5.5 + 2, "beyond the row's end"
         found = ratios(row)
         assert found[0] > 5 * found[3] > 15
+
+    def test_three_spots_by_hand(self) -> None:
+        """At 15, 40 and 60 mm on the line through two matched ones 74 mm apart: a row from -7.5 to 82.5 mm."""
+        along = (OWN[3] - OWN[0]) / np.linalg.norm(OWN[3] - OWN[0])
+        found = ratios(OWN[0] + np.array([[15.0], [40.0], [60.0]]) * along)
+        np.testing.assert_allclose(found[[0, 3]], 3 / (1.5 * (45 + 45 + 1.5)) / (9 / AREA_MM2))
+        np.testing.assert_allclose(np.delete(found, [0, 3]), 1.0)
 
     def test_a_needle_beside_them_says_nothing_of_them(self) -> None:
         needle = np.column_stack([np.full(7, 20.0), 40.0 + STEPS_MM])

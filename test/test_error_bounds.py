@@ -142,6 +142,8 @@ def test_limits_that_make_no_box() -> None:
     model = scene(61, 6, 0.3).model
     with pytest.raises(ValueError, match="max_error_px must not be negative"):
         model.bounds_box(-0.1)
+    with pytest.raises(ValueError, match="max_error_px must not be negative"):
+        model.bounds_box(np.array([*[0.1] * 11, -0.1]))
     with pytest.raises(ValueError, match="low_errors_px must not exceed high_errors_px"):
         model.bound_in_direction(np.ones(9), 0.5, -0.5)
 

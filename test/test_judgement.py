@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoreg_ros import Pose, RegistrationOptions, judgement, load_frame, register_spots
+from stereoreg_ros import Pose, RegistrationOptions, judgement, load_frame, register_spots, registration
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
@@ -28,10 +28,13 @@ from stereoreg_ros.judgement import (
     other_scale,
     second_frame,
 )
+from stereoreg_ros.matching import three_line
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.other_scale import OtherScale
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.three_line import SearchGivenUpError
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from stereoreg_ros.simulation import ScannerSettings, centred_pose, random_pose
 from stereoreg_ros.simulation.mistakes import Surroundings, contradicted_prior, sister
@@ -427,6 +430,16 @@ def noisy(rng: np.random.Generator, frame: Frame, pose: Pose) -> Array:
     return spots
 
 
+def narrow() -> tuple[Frame, Array]:
+    """Five rods that stand together, and their spots, pixel."""
+    starts = np.array([[0.0, 0, -30], [9, 0, -30], [0, 9, -30], [9, 9, -30], [4, 5, -30]])
+    ends = np.array([[4.0, 2, 30], [6, 7, 30], [5, 3, 30], [0, 5, 30], [9, 0, 30]])
+    wider = np.array([2.0, 2.0, 1.0])
+    frame = Frame("narrow", tuple("abcde"), wider * starts, wider * ends, np.ones(5))
+    pose = Pose(rotation_exp(np.array([0.05, -0.08, 0.2])), np.array([128.0, 128.0, 4.0]))
+    return frame, project(frame, pose, SCALE)[0]
+
+
 class TestSlices:
     """What deserves its refusal, from spots."""
 
@@ -498,6 +511,78 @@ class TestSlices:
             # Of two whole ones neither is the better.
             assert ("shows the frame twice" in result.message) == (missing > 0)
 
+    def test_a_search_that_takes_too_long_is_refused_and_says_so(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        spots = noisy(np.random.default_rng(6), FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
+        assert register_spots(spots, FRAME, SCALE, STANDING)
+        monkeypatch.setattr(three_line, "_MOST_WORK", 1.0)
+        result = register_spots(spots, FRAME, SCALE, STANDING)
+        assert not result
+        assert result.reason == "no_consensus"
+        assert "6 spots was given up: too many of them look like parts of the frame" in result.message
+
+    def test_what_was_found_before_a_search_was_given_up_is_no_pose(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Its twins are not known."""
+
+        def endless(*_: object, **__: object) -> None:
+            raise SearchGivenUpError
+
+        spots = noisy(np.random.default_rng(6), FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
+        monkeypatch.setattr(three_line._Search, "twins_of", endless)
+        result = register_spots(spots, FRAME, SCALE, STANDING)
+        assert not result
+        assert "given up" in result.message
+        assert result.estimates == ()
+
+    def test_what_nothing_is_known_to_contradict_for_lack_of_time_is_no_pose(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def endless(*_: object, **__: object) -> None:
+            raise SearchGivenUpError
+
+        spots = noisy(np.random.default_rng(6), FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
+        monkeypatch.setattr(registration, "find_better", endless)
+        result = register_spots(spots, FRAME, SCALE, STANDING)
+        assert not result
+        assert result.reason == "no_consensus"
+        assert "a pose of 6 rods was found, but the search for one that contradicts it among 6 spots took too long" in (
+            result.message
+        )
+
+    @pytest.mark.parametrize("left", [3, 4])
+    def test_rivals_are_sought_elsewhere_among_all_spots_and_as_configured_among_those_left(
+        self, left: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Elsewhere only what is told apart from the best; of what is left, where it may be a frame, one rod less."""
+        asked: list[tuple[object, ...]] = []
+
+        def nothing(spots: Spots, _: Frame, prior: Prior, *more: object, **named: object) -> None:
+            asked.append((len(spots.mm), math.degrees(prior.max_rotation), *more[1:], named))
+
+        monkeypatch.setattr(registration, "find_better", nothing)
+        monkeypatch.setattr(registration, "score", lambda *_: 100.0)
+        rng = np.random.default_rng(6)
+        spots = noisy(rng, FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
+        spots = np.concatenate([rng.uniform(0, 60, (left, 2)), spots])
+        assert register_spots(spots, FRAME, SCALE, STANDING)
+        elsewhere: tuple[object, ...] = (6 + left, 180.0, -3.0, 100.0 + 3.0 * math.log(10), {})
+        here: tuple[object, ...] = (left, pytest.approx(40.0), -3.0, {"fewest": 5})
+        assert asked == ([elsewhere, here] if left >= 4 else [elsewhere])
+
+    @pytest.mark.parametrize("max_rotation_deg", [40.0, 180.0])
+    def test_another_scale_is_looked_for_whatever_is_known_of_the_orientation(
+        self, max_rotation_deg: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        rng = np.random.default_rng(6)
+        spots = noisy(rng, FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
+        options = RegistrationOptions(max_rotation_deg=max_rotation_deg)
+        assert register_spots(spots[:5], FRAME, SCALE, options, slice_area_mm2=AREA_MM2)
+        found = OtherScale(6, np.array([0.03, 0.03]), 50.0)
+        monkeypatch.setattr(registration, "with_other_scale", lambda *_: found)
+        result = register_spots(spots[:5], FRAME, SCALE, options, slice_area_mm2=AREA_MM2)
+        assert not result
+        assert result.reason == "contradicted"
+        assert "spacing" in result.message
+
     def test_a_second_frame_elsewhere_does_not_matter_beside_the_one_that_was_there(self) -> None:
         """Where the pose before is known, that one is meant."""
         rng = np.random.default_rng(5)
@@ -511,12 +596,7 @@ class TestSlices:
 
     def test_a_weak_pose_is_refused_and_accepted_only_on_purpose(self) -> None:
         """Five rods that stand together tell the tilt badly."""
-        starts = np.array([[0.0, 0, -30], [9, 0, -30], [0, 9, -30], [9, 9, -30], [4, 5, -30]])
-        ends = np.array([[4.0, 2, 30], [6, 7, 30], [5, 3, 30], [0, 5, 30], [9, 0, 30]])
-        wider = np.array([2.0, 2.0, 1.0])
-        frame = Frame("narrow", tuple("abcde"), wider * starts, wider * ends, np.ones(5))
-        pose = Pose(rotation_exp(np.array([0.05, -0.08, 0.2])), np.array([128.0, 128.0, 4.0]))
-        spots, _ = project(frame, pose, SCALE)
+        frame, spots = narrow()
         options = RegistrationOptions(max_rotation_deg=20.0, max_log10_false_alarms=0.0)
         refused = register_spots(spots, frame, SCALE, options, slice_area_mm2=AREA_MM2)
         assert not refused
@@ -528,3 +608,29 @@ class TestSlices:
         accepted = register_spots(spots, frame, SCALE, on_purpose, slice_area_mm2=AREA_MM2)
         assert accepted
         assert "weakly determined" in accepted.caution
+
+    def test_a_weak_pose_that_others_have_widened_stays_as_wide(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What is seen along the valley of its own matches takes nothing from that."""
+        frame, spots = narrow()
+        options = RegistrationOptions(
+            max_rotation_deg=20.0,
+            max_log10_false_alarms=0.0,
+            max_target_error_mm=1000.0,
+            spot_noise_px=0.15,
+            frame_tolerance_mm=0.1,
+            scale_tolerance=0.0,
+        )
+
+        def widening(*given: object) -> Found:
+            (one,) = three_line.match(*given).hypotheses  # type: ignore[arg-type]
+            widened = replace(one, information=one.information / 2, is_widened=True)
+            widest.append(np.asarray(np.linalg.inv(widened.information), dtype=np.float64))
+            return Found([widened], 5)
+
+        widest: list[Array] = []
+        monkeypatch.setitem(registration._MATCHERS, "three_line", widening)
+        result = register_spots(spots, frame, SCALE, options, slice_area_mm2=AREA_MM2)
+        assert result
+        assert "weakly determined" in result.caution
+        root = np.linalg.inv(np.linalg.cholesky(widest[0]))
+        assert np.linalg.eigvalsh(root @ result.covariance @ root.T).min() > 1 - 1e-6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from frames import cube_by_hand
 from stereoreg_ros import RegistrationOptions, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle
-from stereoreg_ros.geometry.projection import point_line_distances
+from stereoreg_ros.geometry.projection import cut, point_line_distances
 from stereoreg_ros.matching import maurin2009
-from stereoreg_ros.matching.maurin2009 import SUCCESS, samples_for, search
+from stereoreg_ros.matching.hypothesis import UNMATCHED
+from stereoreg_ros.matching.maurin2009 import SUCCESS, Consensus, _one_to_one, samples_for, search
 from stereoreg_ros.simulation import ScannerSettings, SpotSet, SpotSetSettings, random_spot_set
 from stereoreg_ros.solvers.linear_system import condition_number
 
@@ -101,6 +103,21 @@ class TestRegistration:
         np.testing.assert_array_equal(first.scanner_from_frame.rotation, again.scanner_from_frame.rotation)
         np.testing.assert_array_equal(first.scanner_from_frame.translation, again.scanner_from_frame.translation)
 
+    def test_what_it_finds_is_refined_and_judged_like_any_other_match(self, cube: Frame) -> None:
+        """The same pose, as uncertain and as unlikely by chance, as of the same matches found the other way."""
+        spots = problem(0, cube).spots_px
+        given = RegistrationOptions(spot_noise_px=NOISE_PX, min_inliers=6)
+        paper, ours = (
+            register_spots(spots, cube, SCALE, replace(given, matcher=m)) for m in ("maurin2009", "three_line")
+        )
+        assert paper
+        assert ours
+        np.testing.assert_allclose(paper.scanner_from_frame.translation, ours.scanner_from_frame.translation, atol=1e-4)
+        stds = np.sqrt(np.diag(ours.covariance))
+        np.testing.assert_allclose((paper.covariance - ours.covariance) / np.outer(stds, stds), 0.0, atol=0.01)
+        assert paper.estimate.chi_square == pytest.approx(ours.estimate.chi_square, rel=0.01)
+        assert paper.estimate.log10_false_alarms == pytest.approx(ours.estimate.log10_false_alarms, abs=0.01)
+
     def test_clutter_alone_is_refused(self, cube: Frame) -> None:
         for seed in range(3):
             spots = np.random.default_rng(seed).uniform(100, 400, (6, 2))
@@ -121,17 +138,20 @@ class TestSearch:
         spots_mm, noise_mm = SCALE.to_mm(given.spots_px), 0.15
         result = search(spots_mm, cube, noise_mm)
         assert result.qualified
+        farthest = 0.0
         assert [one.std_mm for one in result.qualified] == sorted(one.std_mm for one in result.qualified)
         for one in result.qualified:
             lines, spots = np.array(one.pairs).T
             assert len(set(lines)) > 4
             distances = point_line_distances(cube, lines, one.frame_from_slice.inverse(), spots_mm[spots])
             assert distances.max() < math.sqrt(6) * noise_mm
+            farthest = max(farthest, float(distances.max()))
             assert one.std_mm == pytest.approx(np.sqrt((distances**2).mean()))
             in_frame = one.frame_from_slice @ np.column_stack([spots_mm[spots], np.zeros(len(spots))])
             position = np.einsum("ij,ij->i", cube.directions[lines], in_frame)
             assert (position >= cube.lambda_min[lines]).all()
             assert (position <= cube.lambda_max[lines]).all()
+        assert farthest > 0.8 * math.sqrt(6) * noise_mm, "all that are within reach count"
         position, _ = errors(result.qualified[0].frame_from_slice.inverse(), given.slice_from_frame)
         assert position < 3
 
@@ -160,6 +180,19 @@ class TestSearch:
         result = search(np.ones((spots, 2)), cube, 0.15)
         assert result.qualified == []
         assert (result.samples, result.planned) == (0, 0)
+
+
+class TestOneToOne:
+    """A consensus may give a rod several spots and a spot to several rods: the nearest couples are kept."""
+
+    def test_by_hand(self, cube: Frame) -> None:
+        """Spot 0 is nearest to rod 0, which may have spot 1 too; rod 1 may have spots 0 and 2, rod 2 only spot 2."""
+        start = Pose(np.eye(3), np.array([100.0, 90.0, 3.0]))
+        cuts = cut(cube, start.rotation, start.translation).points_mm
+        spots = np.array([cuts[0] + [0.1, 0.0], cuts[0] + [0.0, 0.5], cuts[1] + [0.3, 0.0], cuts[3]])
+        pairs = ((0, 0), (0, 1), (1, 0), (1, 2), (2, 2), (3, 3))
+        found = _one_to_one(Consensus(start.inverse(), pairs, 0.1), cube, spots)
+        assert found.tolist() == [0, 2, UNMATCHED, 3, UNMATCHED, UNMATCHED]
 
 
 class TestCollinearityConstraint:

@@ -315,6 +315,33 @@ class TestSharedErrors:
             assert together.chi_square[row] == pytest.approx(alone.chi_square[0], rel=1e-8)
             np.testing.assert_allclose(together.translations[row], alone.translations[0], atol=1e-6)
 
+    def test_those_that_go_on_keep_their_own_spots_weights_and_errors(self) -> None:
+        """Of eight poses every other one starts where it ends, and rests long before its neighbours."""
+        frame, true, spots, whitening, common = self.drawn(54, 6)
+        rng = np.random.default_rng(2)
+        weights = rng.uniform(0.5, 2.0, (8, 6, 1, 1)) * whitening
+        shared = rng.uniform(0.2, 5.0, (8, 1, 1, 1)) * common
+        targets = spots + rng.normal(0, 0.3, (8, 6, 2))
+        used = rng.random((8, 6)) > 0.1
+        far = [true.perturbed(rng.normal(0, 3.0, 3), rng.normal(0, 0.1, 3)) for _ in range(8)]
+
+        def from_poses(rotations: Array, translations: Array, rows: slice) -> Refined:
+            return refine(frame, rotations, translations, targets[rows], used[rows], weights[rows], 100, shared[rows])
+
+        def alone(row: int) -> Refined:
+            return from_poses(far[row].rotation[None], far[row].translation[None], slice(row, row + 1))
+
+        each = [alone(row) for row in range(8)]
+        rotations = np.stack([each[row].rotations[0] if row % 2 == 0 else far[row].rotation for row in range(8)])
+        translations = np.stack(
+            [each[row].translations[0] if row % 2 == 0 else far[row].translation for row in range(8)]
+        )
+        together = from_poses(rotations, translations, slice(None))
+        for row in range(8):
+            assert together.chi_square[row] == pytest.approx(each[row].chi_square[0], rel=1e-7)
+            np.testing.assert_allclose(together.translations[row], each[row].translations[0], atol=1e-4)
+            np.testing.assert_allclose(together.information[row], each[row].information[0], rtol=1e-3)
+
     def test_errors_are_as_large_as_the_information_says(self) -> None:
         count, n = 1000, 6
         frame, true, exact = scene(53, n)

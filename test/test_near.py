@@ -12,6 +12,7 @@ from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.matching import three_line
+from stereoreg_ros.matching.hypothesis import Found
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
@@ -158,6 +159,55 @@ def test_the_orientation_that_is_allowed_holds_near_a_guess_too() -> None:
     options = RegistrationOptions(nominal_orientation=tuple(elsewhere), max_rotation_deg=30.0)
     assert register_spots(spots, CUBE, SCALE, previous=truth)
     assert not register_spots(spots, CUBE, SCALE, options, previous=truth)
+
+
+@pytest.mark.parametrize(("degrees", "is_near"), [(4.5, True), (5.5, False)])
+def test_near_is_within_five_degrees(degrees: float, is_near: bool) -> None:
+    """What is found from a guess that is farther off is as unlikely by chance as what is found without."""
+    rng = np.random.default_rng(11)
+    truth = random_pose(rng, CUBE, SCANNER)
+    spots, _ = project(CUBE, truth, SCALE)
+    turned = truth.perturbed(np.zeros(3), math.radians(degrees) * np.array([0.6, 0.8, 0.0]))
+    # Turned about the frame's middle, so that its rods are still near.
+    middle = (CUBE.starts.mean(axis=0) + CUBE.ends.mean(axis=0)) / 2
+    guess = Pose(turned.rotation, turned.translation + truth @ middle - turned @ middle)
+    options = RegistrationOptions(max_rotation_deg=170.0)
+    result, alone = (register_spots(spots, CUBE, SCALE, options, previous=one) for one in (guess, None))
+    assert result
+    assert alone
+    assert result.options is options
+    assert (result.estimate.log10_false_alarms < alone.estimate.log10_false_alarms - 2) is is_near
+
+
+def test_other_matches_of_the_pose_widen_it_near_a_guess_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(12)
+    truth = random_pose(rng, CUBE, SCANNER)
+    spots = project(CUBE, truth, SCALE)[0] + rng.normal(0, 0.2, (6, 2))
+    plain = register_spots(spots, CUBE, SCALE, PERFECT, previous=truth)
+
+    def widening(*given, **named) -> Found:
+        (one,) = match(*given, **named).hypotheses
+        return Found([replace(one, information=one.information / 4, is_widened=True)], 6)
+
+    match = three_line.match
+    monkeypatch.setattr(three_line, "match", widening)
+    wide = register_spots(spots, CUBE, SCALE, PERFECT, previous=truth)
+    assert plain
+    assert wide
+    np.testing.assert_allclose(wide.covariance, 4 * plain.covariance, rtol=1e-9)
+
+
+def test_where_twins_are_sought_in_vain_for_long_there_is_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    def endless(*_: object, **__: object) -> None:
+        raise three_line.SearchGivenUpError
+
+    truth = random_pose(np.random.default_rng(13), CUBE, SCANNER)
+    spots, _ = project(CUBE, truth, SCALE)
+    assert register_spots(spots, CUBE, SCALE, previous=truth)
+    monkeypatch.setattr(three_line._Search, "twins_of", endless)
+    result = register_spots(spots, CUBE, SCALE, previous=truth)
+    assert not result
+    assert "given up" in result.message
 
 
 def test_guesses_that_make_no_sense() -> None:

@@ -65,6 +65,15 @@ class TestVisibility:
         assert bool(may_show(rods, cuts)[0]) is may
         assert bool(must_show(rods, cuts)[0]) is must
 
+    def test_which_end_is_called_the_first_does_not_matter(self) -> None:
+        rods = frame()
+        turned = replace(rods, starts=rods.ends, ends=rods.starts)
+        cuts = cut(turned, np.eye(3), np.zeros(3))
+        np.testing.assert_allclose(cuts.points_mm, PLACES, atol=1e-12)
+        assert cuts.inside.all()
+        assert may_show(turned, cuts).all()
+        assert must_show(turned, cuts).all()
+
     @pytest.mark.parametrize(("degrees", "shows"), [(11.6, True), (11.4, False)])
     def test_near_the_slice(self, degrees: float, shows: bool) -> None:
         slopes = SLOPES.copy()

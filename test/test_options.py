@@ -99,7 +99,9 @@ def test_orientation_becomes_a_tuple_that_can_be_compared_and_hashed() -> None:
 
 
 @pytest.mark.parametrize(
-    "target", [(0.0, 0.0), (0.0, 0.0, np.nan), (0.0, np.inf, 0.0), (0.0, 0.0, 10001.0), "tip", None, 5.0], ids=str
+    "target",
+    [(0.0, 0.0), (0.0, 0.0, np.nan), (0.0, np.inf, 0.0), (0.0, 0.0, 10001.0), (-10001.0, 0.0, 0.0), "tip", None, 5.0],
+    ids=str,
 )
 def test_target_is_a_point(target: Any) -> None:
     with pytest.raises(

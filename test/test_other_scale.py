@@ -85,6 +85,19 @@ def test_a_wrong_spacing_is_found_with_its_size(share: float) -> None:
     assert far >= 3, "else it need not be found"
 
 
+@pytest.mark.parametrize(("share", "too_large"), [(0.12, 0.108), (0.2, 0.167), (-0.12, -0.135), (-0.14, -0.158)])
+def test_more_than_fifteen_per_cent_is_believed_of_no_scale(share: float, too_large: float) -> None:
+    """Either way; the pixels of this scene are too long, or too short, along y."""
+    frame = load_frame("leksell_ct9")
+    scene = wrong_spacing(np.random.default_rng([5, 0]), frame, AROUND, share=share)
+    spots, matches = spots_of(scene), true_matches(scene)
+    matches[4] = UNMATCHED
+    other = with_other_scale(explained(scene, spots, matches), spots, frame, PRIOR)
+    assert other is not None
+    assert other.too_large == pytest.approx([0.0, too_large], abs=0.004)
+    assert (other.evidence > SURE) is (abs(too_large) < 0.15)
+
+
 def test_where_rods_meet_the_one_may_have_taken_the_spot_of_the_other() -> None:
     frame = load_frame("leksell_ct9")
     found = 0

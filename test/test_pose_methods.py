@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations, islice, pairwise
 
 import numpy as np
@@ -15,13 +16,20 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, rotation_angle, rotation_exp, skew
 from stereoreg_ros.geometry.projection import point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.solvers.linear_system import MAX_CONDITION, POSE_RANK, assemble, condition_number, linear_system
+from stereoreg_ros.solvers.linear_system import (
+    MAX_CONDITION,
+    POSE_RANK,
+    LinearSystem,
+    assemble,
+    condition_number,
+    linear_system,
+)
 from stereoreg_ros.solvers.ls_svd import solve_ls_svd, solve_ls_svd_dr
 from stereoreg_ros.solvers.ls_tz import solve_ls_tz, solve_system
 from stereoreg_ros.solvers.maximum_likelihood import refine, solve_maximum_likelihood
 from stereoreg_ros.solvers.methods import POSE_METHODS
 from stereoreg_ros.solvers.newton_raphson import minimise, pose_constraints, solve_newton_raphson
-from stereoreg_ros.solvers.one_parameter import orthogonality_roots
+from stereoreg_ros.solvers.one_parameter import orthogonality_roots, poses, unit_length_violation
 from stereoreg_ros.solvers.pose_solution import PoseSolution, PoseSolver
 from stereoreg_ros.uncertainty import cramer_rao_pose
 
@@ -295,6 +303,65 @@ class TestClosedForms:
             found = solve_ls_tz(turned, np.arange(n), spots, SCALE)
             assert any(is_exact(one, true) for one in found)
 
+    @pytest.mark.parametrize("n", [4, 6])
+    @pytest.mark.parametrize("solve", POSE_METHODS.values(), ids=POSE_METHODS)
+    def test_the_signs_of_singular_vectors_mean_nothing(
+        self, n: int, solve: PoseSolver, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Which of the two signs a library gives is by chance."""
+        svd = np.linalg.svd
+
+        def other_signs(matrix: Array, *given, **named):
+            found = svd(matrix, *given, **named)
+            return (-found[0], found[1], -found[2]) if isinstance(found, tuple) else found
+
+        solutions = 0
+        for seed in range(8):
+            frame, _, spots = scene(320 + seed, n)
+            spots = spots + np.random.default_rng(seed).normal(0, 0.3, spots.shape)
+            # With tz in the open direction, and with next to nothing of it.
+            for turn in (np.eye(3), rotation_exp(np.array([0.4, -1.2, 0.3]))):
+                turned = replace(frame, starts=frame.starts @ turn.T, ends=frame.ends @ turn.T)
+                there = solve(turned, np.arange(n), spots, SCALE)
+                with monkeypatch.context() as patch:
+                    patch.setattr(np.linalg, "svd", other_signs)
+                    back = solve(turned, np.arange(n), spots, SCALE)
+                assert len(there) == len(back)
+                solutions += len(there)
+                for one, other in zip(there, back, strict=True):
+                    assert max(errors(one, other.frame_from_slice.inverse())) < 1e-7
+        assert solutions >= 8
+
+    def test_of_the_redundant_candidates_the_one_of_least_violation_is_taken(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """c by each of two ratios of the singular vector, and their mean: one is least off the three constraints."""
+        kept = []
+
+        def recorded(system: LinearSystem, a: Array, b: Array, roots: list[float]) -> list[PoseSolution]:
+            kept.append((system.spread**2, a, b, roots))
+            return poses(system, a, b, roots)
+
+        monkeypatch.setattr("stereoreg_ros.solvers.ls_svd.poses", recorded)
+        for seed in range(20):
+            frame, _, spots = scene(340 + seed, 5)
+            noisy = spots + np.random.default_rng(seed).normal(0, 0.5, spots.shape)
+            assert len(solve_ls_svd_dr(frame, np.arange(5), noisy, SCALE)) == 1
+            unit, a, b, (chosen,) = kept.pop()
+            (a1, a2), (b1, b2) = a[:6].reshape(2, 3), b[:6].reshape(2, 3)
+            size = np.linalg.norm(a[:6]) / np.linalg.norm(b[:6])
+            rows = [(a1 @ a1 - unit, 2 * a1 @ b1, b1 @ b1), (a2 @ a2 - unit, 2 * a2 @ b2, b2 @ b2)]
+            rows.append((a1 @ a2, a1 @ b2 + a2 @ b1, b1 @ b2))
+            x, y, z = np.linalg.svd(np.array(rows) * size ** np.arange(3))[2][2]
+
+            def violation(c: float, a1=a1, a2=a2, b1=b1, b2=b2, unit=unit) -> float:
+                r1, r2 = a1 + c * b1, a2 + c * b2
+                return float((r1 @ r1 - unit) ** 2 + (r2 @ r2 - unit) ** 2 + (r1 @ r2) ** 2)
+
+            candidates = size * np.array([y / x, z / y, (y / x + z / y) / 2])
+            best = min(candidates, key=violation)
+            assert chosen == pytest.approx(best, rel=1e-6, abs=1e-9)
+
 
 class TestOrthogonalityRoots:
     """Of eq. 31, b1.b2 c^2 + (a1.b2 + a2.b1) c + a1.a2 = 0."""
@@ -354,7 +421,24 @@ class TestOrthogonalityRoots:
                 assert sorted(orthogonality_roots(a, b)) == pytest.approx(sorted(expected), rel=1e-9)
 
 
+def test_lengths_that_make_up_for_each_other_are_off_all_the_same() -> None:
+    """Squared lengths of 1.5 and 0.5 are off by a half each."""
+    system = LinearSystem(np.eye(9), np.zeros(9), np.zeros(2), 1.0)
+    assert unit_length_violation(system, np.array([np.sqrt(1.5), 0, 0, 0, np.sqrt(0.5), 0, 7, 8, 9])) == pytest.approx(
+        0.5
+    )
+    assert unit_length_violation(system, np.array([0, 0, 1.0, 0.6, 0.8, 0, 7, 8, 9])) == pytest.approx(0.0)
+
+
 class TestNewtonRaphson:
+    def test_without_a_step_there_is_no_solution(self) -> None:
+        """A system that says nothing, at a start where no constraint has a slope: the matrix has no inverse."""
+        nothing = LinearSystem(np.zeros((9, 9)), np.zeros(9), np.zeros(2), 1.0)
+        x, _, converged, iterations = minimise(nothing, pose_constraints(nothing), np.zeros(9))
+        np.testing.assert_array_equal(x, np.zeros(9))
+        assert not converged
+        assert iterations == 1
+
     @pytest.mark.parametrize("n", [4, 5, 8])
     def test_is_a_stationary_point_on_the_constraints(self, n: int) -> None:
         for seed in range(4):
@@ -426,6 +510,13 @@ class TestNewtonRaphson:
 
 
 class TestMaximumLikelihood:
+    def test_what_has_not_converged_is_no_solution(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        frame, _, spots = scene(360, 6)
+        spots = spots + np.random.default_rng(0).normal(0, 1.0, spots.shape)
+        assert solve_maximum_likelihood(frame, np.arange(6), spots, SCALE)
+        monkeypatch.setattr("stereoreg_ros.solvers.maximum_likelihood._PATIENCE", 1)
+        assert solve_maximum_likelihood(frame, np.arange(6), spots, SCALE) == []
+
     @pytest.mark.parametrize("scale", [SCALE, OBLONG], ids=["square", "oblong and sheared"])
     @pytest.mark.parametrize("n", [4, 5, 8])
     def test_gradient_in_the_image_is_zero(self, n: int, scale: PixelScale) -> None:

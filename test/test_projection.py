@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from frames import random_frame, random_slice_from_frame
@@ -83,6 +85,21 @@ class TestCut:
         for chosen in (np.array([False, True, False, False, True]), np.array([1, 4])):
             for whole, part in zip(cuts, cuts.take(chosen), strict=True):
                 np.testing.assert_array_equal(part, whole[[1, 4]])
+
+    def test_which_end_is_called_the_first_does_not_matter(self) -> None:
+        rng = np.random.default_rng(19)
+        frame = random_frame(rng, 6)
+        pose = random_slice_from_frame(rng, frame)
+        turned = replace(frame, starts=frame.ends, ends=frame.starts)
+        there, back = (cut(one, pose.rotation, pose.translation) for one in (frame, turned))
+        np.testing.assert_allclose(back.points_mm, there.points_mm, atol=1e-10)
+        np.testing.assert_allclose(back.lambdas, -there.lambdas, atol=1e-10)
+        assert back.inside.all()
+        jacobians = [cut_jacobian(one, pose.translation) for one in (there, back)]
+        np.testing.assert_allclose(jacobians[1], jacobians[0], atol=1e-9)
+        tolerances = np.linspace(0.1, 0.3, 6)
+        covariances = [rod_covariances(*given) for given in ((frame, tolerances, there), (turned, tolerances, back))]
+        np.testing.assert_allclose(covariances[1], covariances[0], rtol=1e-9)
 
     @pytest.mark.parametrize(("depth", "inside"), [(-10.5, False), (-9.5, True), (9.5, True), (10.5, False)])
     def test_a_cut_beyond_the_ends_is_flagged(self, depth: float, inside: bool) -> None:

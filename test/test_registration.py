@@ -318,6 +318,18 @@ class TestRefusals:
             register_spots(spots, cube, SCALE)
 
 
+def test_as_many_rods_as_must_have_a_spot_are_enough(cube):
+    truth = random_pose(np.random.default_rng(14), cube, SCANNER)
+    spots, _ = project(cube, truth, SCALE)
+    for least in (4, 5, 6):
+        result = register_spots(spots, cube, SCALE, RegistrationOptions(min_inliers=least))
+        assert result
+        assert result.estimate.inliers == 6
+    too_few = register_spots(spots[:5], cube, SCALE, RegistrationOptions(min_inliers=6))
+    assert not too_few
+    assert too_few.reason == "too_few_spots"
+
+
 def test_empty_slice_is_refused(cube):
     result = register_slice(Slice(np.full((64, 64), -1000.0, dtype=np.float32), SCALE), cube)
     assert not result
@@ -407,6 +419,12 @@ class TestRecognition:
         assert refused.reason == "inaccurate"
         assert recognised is not None
         assert len(recognised.matches) == 6
+
+    def test_a_frame_that_asks_for_an_orientation_is_not_recognised_without(self, cube):
+        asking = replace(cube, orientation_required=True)
+        spots, _ = project(cube, random_pose(np.random.default_rng(43), cube, SCANNER), SCALE)
+        assert recognise_spots(spots, asking, SCALE) is None
+        assert recognise_spots(spots, asking, SCALE, RegistrationOptions(max_rotation_deg=90.0)) is not None
 
     def test_nothing_where_nothing_looks_like_the_frame(self, cube):
         assert recognise_spots(np.zeros((0, 2)), cube, SCALE) is None

@@ -68,6 +68,16 @@ class TestFigures:
         assert best.position_std_mm == pytest.approx(0.3)
         assert best.rotation_std_deg == pytest.approx(math.degrees(0.02))
 
+    def test_the_error_at_a_target_is_by_how_the_frame_stands_in_the_scanner(self) -> None:
+        """A quarter turn about z there: 100 mm along the frame's x are along y, where turning about x moves it along z.
+
+        That adds (0.01 rad * 100 mm)^2 along z, and the turn about z (0.001 rad * 100 mm)^2 along x.
+        """
+        quarter = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5.0, 6.0, 7.0]))
+        best = replace(estimate(), scanner_from_frame=quarter)
+        expected = error_ball_95(np.diag([0.01 + 0.01, 0.04, 0.09 + 1.0]))
+        assert best.target_error_95_mm((100.0, 0.0, 0.0)) == pytest.approx(expected)
+
     def test_no_deviation_is_below_zero(self) -> None:
         best = replace(estimate(), covariance=-1e-18 * np.eye(6))
         assert best.position_std_mm == best.rotation_std_deg == 0.0

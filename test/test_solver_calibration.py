@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers import joint_calibration, tolerant_calibration
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import (
     ScaleSolution,
@@ -100,6 +103,12 @@ class TestExact:
         found = solve(frame, lines, spots[lines])
         assert found.scale.sx == pytest.approx(SCALE.sx, abs=1e-9)
         np.testing.assert_allclose(found.frame_from_slice.translation, pose.inverse().translation, atol=1e-9)
+
+    def test_steps_that_do_not_end_have_not_converged(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        series = Series(np.random.default_rng(78), EIGHT_RODS, 1, np.zeros(8))
+        assert calibrate_newton_raphson(EIGHT_RODS, np.arange(8), series.spots_px[0]).converged
+        monkeypatch.setattr("stereoreg_ros.solvers.newton_raphson._MAX_ITERATIONS", 1)
+        assert not calibrate_newton_raphson(EIGHT_RODS, np.arange(8), series.spots_px[0]).converged
 
     def test_counts_its_steps(self) -> None:
         frame, _, spots = scene(8, 6)
@@ -408,6 +417,67 @@ class TestToleranceOfTheFrame:
         assert noise[1] < 0.0005
         assert 0.001 < of_frame < stated[1] < stated[0] < 0.005
         assert of_frame > 0.9 * stated[1]
+
+
+def with_tolerances(series: Series) -> TolerantScale:
+    return series.tolerant()
+
+
+@pytest.mark.parametrize("calibrated", [Series.exact_frame, with_tolerances])
+class TestSeries:
+    """The same of both solvers that take several slices."""
+
+    def test_a_rod_without_a_spot_counts_for_nothing(self, calibrated: Callable[[Series], Any]) -> None:
+        series = Series(np.random.default_rng(75), EIGHT_RODS, 3, np.full(8, 0.1))
+        series.used[1, 2] = series.used[2, 7] = False
+        found = calibrated(series)
+        assert found.degrees_of_freedom == 2 * (3 * 8 - 2) - 6 * 3 - 2
+        series.spots_px[~series.used] = [[-1e4, 3.0], [7.0, 1e5]]
+        again = calibrated(series)
+        assert again.chi_square == pytest.approx(found.chi_square, rel=1e-9)
+        assert (again.scale.sx, again.scale.sy) == pytest.approx((found.scale.sx, found.scale.sy), rel=1e-9)
+        np.testing.assert_array_equal(again.residuals_px[~series.used], 0.0)
+
+    def test_a_step_that_goes_too_far_is_not_taken(
+        self, calibrated: Callable[[Series], Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        series = Series(np.random.default_rng(76), EIGHT_RODS, 3, np.full(8, 0.1))
+        expected = calibrated(series)
+        for module in (joint_calibration, tolerant_calibration):
+            stepped = module._State.step
+            scales = iter([5.0])
+
+            def too_far(self, damping: float, stepped=stepped, scales=scales):
+                scale = next(scales, 1.0)
+                return tuple(scale * part for part in stepped(self, damping))
+
+            monkeypatch.setattr(module._State, "step", too_far)
+        found = calibrated(series)
+        assert found.converged
+        assert found.chi_square == pytest.approx(expected.chi_square, rel=1e-9)
+        assert (found.scale.sx, found.scale.sy) == pytest.approx((expected.scale.sx, expected.scale.sy), rel=1e-7)
+
+    def test_what_has_not_come_to_rest_has_not_converged(
+        self, calibrated: Callable[[Series], Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        series = Series(np.random.default_rng(77), EIGHT_RODS, 3, np.full(8, 0.1))
+        start = series.exact_frame()
+        for module in (joint_calibration, tolerant_calibration):
+            monkeypatch.setattr(module, "_ITERATIONS", 1)
+        if calibrated is Series.exact_frame:
+            assert not calibrated(series).converged
+            return
+        found = calibrate_tolerantly(
+            series.frame,
+            series.tolerances_mm,
+            start.rotations,
+            start.translations,
+            series.spots_px,
+            series.used,
+            series.covariances_px2,
+            start.scale,
+        )
+        assert not found.converged
 
 
 class TestDegenerate:

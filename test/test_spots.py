@@ -61,6 +61,9 @@ class TestCentre:
     def test_from_top_to_bottom(self) -> None:
         spots = spots_of(drawn(np.array([[20.0, 50.0], [60.0, 10.0], [40.0, 30.0]])))
         np.testing.assert_allclose(spots, [[60, 10], [40, 30], [20, 50]], atol=0.05)
+        # Whatever their sizes.
+        large_one_above = drawn(np.array([[60.0, 14.0]]), sigma=3.0) + drawn(np.array([[20.0, 50.0], [40.0, 36.0]]))
+        np.testing.assert_allclose(spots_of(large_one_above), [[60, 14], [40, 36], [20, 50]], atol=0.05)
 
 
 class TestWhatIsASpot:
@@ -90,6 +93,9 @@ class TestWhatIsASpot:
         assert found(1.21, 3.21) == [large]
         assert found(1.19, 3.19) == [small]
         assert found(1.21, 3.19) == []
+        # Areas of 1.5 and 4 mm^2 to the last bit: the limits themselves are allowed.
+        scale = PixelScale(0.5, 0.5)
+        assert found(1.5, 4.0) == [small, large]
 
     def test_threshold_is_exclusive(self) -> None:
         image = blank()
@@ -138,6 +144,26 @@ class TestWhatIsASpot:
         image[20:23, 20:23] = 5000
         image[20:23, 25:28] = 9000
         np.testing.assert_allclose(spots_of(image), [[21, 21], [26, 21]], atol=0.05)
+
+    def test_nor_do_they_make_each_other_longer(self) -> None:
+        """A square of three pixels has second moments of two thirds, however near the next one is."""
+        image = blank()
+        image[20:23, 20:23] = 5000
+        image[20:23, 24:27] = 9000
+        found = find_spots(Slice(image.astype(np.float32), SCALE), OPTIONS)
+        np.testing.assert_allclose(found.extents_px2, np.tile(2 / 3 * np.eye(2), (2, 1, 1)), atol=0.01)
+
+    def test_what_is_around_a_spot_is_no_other_things_brightness(self) -> None:
+        """A bright wall around three quarters of it: the level is that of the rest."""
+        image = blank()
+        image[22:39, 32:49] = 3000
+        image[25:36, 35:46] = 40
+        image[30:39, 40:49] = 40
+        image[29:32, 39:42] = 5000
+        options = RegistrationOptions(threshold=2000.0, max_spot_area_mm2=5.0)
+        found = find_spots(Slice(image.astype(np.float32), SCALE), options)
+        np.testing.assert_allclose(found.centres_px, [[40, 30]], atol=0.01)
+        np.testing.assert_allclose(found.extents_px2, [2 / 3 * np.eye(2)], atol=0.01)
 
 
 class TestLimitOfTheError:

@@ -10,7 +10,7 @@ from frames import random_frame
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame, shipped_frames
-from stereoreg_ros.matching.triple_order import RankedTriple, triple_order
+from stereoreg_ros.matching.triple_order import RankedTriple, further_triples, triple_order
 
 MIN_INLIERS = 4
 
@@ -108,3 +108,42 @@ def test_is_the_same_every_time() -> None:
     assert one is not other
     assert triple_order(one, MIN_INLIERS) == triple_order(other, MIN_INLIERS)
     assert triple_order.__wrapped__(one, MIN_INLIERS) == triple_order(one, MIN_INLIERS)
+
+
+def tried_for(frame: Frame, rods: int) -> list[tuple[int, int, int]]:
+    """The triples that `triple_order` has tried once every set of so many rods holds one."""
+    order = triple_order(frame, MIN_INLIERS)
+    return [
+        entry.lines for entry in order[: 1 + next(i for i, entry in enumerate(order) if entry.complete_from <= rods)]
+    ]
+
+
+class TestFurtherTriples:
+    """A second look: every set of rods holds so many triples that were tried, and no triple is tried for nothing."""
+
+    @pytest.mark.parametrize("rods", [4, 5, 6])
+    @pytest.mark.parametrize("looks", [2, 3])
+    def test_every_set_holds_as_many_as_asked_for(self, rods: int, looks: int) -> None:
+        frame = random_frame(np.random.default_rng(80), 7)
+        first, further = tried_for(frame, rods), further_triples(frame, MIN_INLIERS, rods, looks)
+        assert not set(first) & set(further)
+        assert len(set(further)) == len(further)
+        held = dict.fromkeys((frozenset(one) for one in combinations(range(7), rods)), 0)
+        for number, triple in enumerate([*first, *further]):
+            holding = [one for one in held if set(triple) <= one]
+            assert number < len(first) or any(held[one] < looks for one in holding), f"{triple} serves no set"
+            for one in holding:
+                held[one] += 1
+        assert min(held.values()) >= looks
+
+    def test_one_look_is_what_the_order_itself_gives(self) -> None:
+        for rods in (4, 5, 6, 7):
+            assert further_triples(random_frame(np.random.default_rng(81), 7), MIN_INLIERS, rods, 1) == ()
+
+    def test_more_looks_than_there_are_triples_are_all_of_them(self) -> None:
+        frame = random_frame(np.random.default_rng(82), 5)
+        every = {*tried_for(frame, 4), *further_triples(frame, MIN_INLIERS, 4, 100)}
+        assert every == set(combinations(range(5), 3))
+
+    def test_of_more_rods_than_there_are_none(self) -> None:
+        assert further_triples(random_frame(np.random.default_rng(83), 5), MIN_INLIERS, 6, 2) == ()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice, register_spots
+from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice, register_spots, registration
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
@@ -177,6 +177,29 @@ def test_each_is_looked_for_where_it_was_itself(scenes) -> None:
         assert isinstance(one, Registration)
         assert isinstance(other, Registration)
         assert one.estimate.log10_false_alarms < other.estimate.log10_false_alarms - 3
+
+
+@pytest.mark.parametrize("poses", [1, 3])
+def test_poses_before_are_one_for_each_frame(scenes, poses: int) -> None:
+    with pytest.raises(ValueError, match=f"previous has {poses} poses, expected one for each of 2 frames"):
+        register_frames(scenes[0][0], [FIRST, SECOND], previous=[None] * poses)
+
+
+def test_one_that_is_sought_again_is_looked_for_where_it_was_itself(scenes, monkeypatch: pytest.MonkeyPatch) -> None:
+    ct_slice, first, _ = scenes[1]
+    sought = []
+
+    def recorded(seen, frame: Frame, options: RegistrationOptions, previous: Pose | None) -> Registration | Refusal:
+        sought.append((len(seen.spots_px), previous))
+        return register(seen, frame, options, previous)
+
+    register = registration._register
+    monkeypatch.setattr(registration, "_register", recorded)
+    nearby = first.perturbed(np.array([0.5, 0.0, 0.0]), np.zeros(3))
+    one, again = register_frames(ct_slice, [FIRST, FIRST], previous=[first, nearby])
+    assert_right(one, FIRST, first)
+    assert not again
+    assert sought == [(12, first), (12, nearby), (6, nearby)]
 
 
 # Of (sx, sy, shear).

@@ -245,6 +245,10 @@ class TestWhitened:
         values = [whitened(rng, 3).scale_misfit().fall for _ in range(50)]
         assert max(values) < 1e-3
 
+    def test_scale_misfit_says_how_well_the_scale_was_stated(self) -> None:
+        given = whitened(np.random.default_rng(13), 6)
+        assert given._replace(scale_std=0.004).scale_misfit()[1:] == (2, 0.004)
+
     def test_a_scale_without_an_error_has_no_misfit(self) -> None:
         given = whitened(np.random.default_rng(11), 6, scales=0, others=2)
         assert given.scale_misfit() == ScaleMisfit()
