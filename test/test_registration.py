@@ -184,6 +184,18 @@ def test_prior_is_about_the_scanner_not_the_slice(cube):
     assert not register_spots(spots, cube, SCALE, in_slice, scanner_from_slice=oblique)
 
 
+def test_a_pose_is_within_the_angle_to_a_fraction_of_a_degree(cube):
+    """Searches start from poses some degrees beyond it, which may be refined into it."""
+    rng = np.random.default_rng(15)
+    for _ in range(3):
+        truth = random_pose(rng, cube, SCANNER, max_tilt_deg=15.0)
+        spots, _ = project(cube, truth, SCALE)
+        degrees = math.degrees(float(rotation_angle(truth.rotation)))
+        assert degrees > 3.0
+        assert register_spots(spots, cube, SCALE, RegistrationOptions(max_rotation_deg=degrees + 0.3))
+        assert not register_spots(spots, cube, SCALE, RegistrationOptions(max_rotation_deg=degrees - 0.3))
+
+
 def test_spots_beyond_a_rods_end_are_not_on_it(cube):
     truth = centred_pose(cube, SCANNER)
     far = Pose(truth.rotation, truth.translation + np.array([0.0, 0.0, 45.0]))  # the cube ends 15 mm before the slice

@@ -157,8 +157,8 @@ class TestWhatIsASpot:
         """A bright wall around three quarters of it: the level is that of the rest."""
         image = blank()
         image[22:39, 32:49] = 3000
-        image[25:36, 35:46] = 40
-        image[30:39, 40:49] = 40
+        image[26:35, 36:45] = 40
+        image[31:39, 41:49] = 40
         image[29:32, 39:42] = 5000
         options = RegistrationOptions(threshold=2000.0, max_spot_area_mm2=5.0)
         found = find_spots(Slice(image.astype(np.float32), SCALE), options)

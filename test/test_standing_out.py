@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.spots.contrast import _regions, regions_by_contrast
-from stereoreg_ros.spots.peaks import Peaks
+from stereoreg_ros.spots import contrast
+from stereoreg_ros.spots.contrast import _Candidate, _regions, regions_by_contrast
+from stereoreg_ros.spots.peaks import Peaks, find_peaks
 from stereoreg_ros.spots.prominence import Prominence, SmoothSlice, least_height, prominences
 from stereoreg_ros.spots.regions import Regions, parted, regions_above
 
@@ -21,6 +22,28 @@ def peak_at(u: int, v: int, top: float, rough_height: float) -> Peaks:
 def test_least_height_is_six_times_the_noise_and_no_less_than_a_unit() -> None:
     assert least_height(2.0) == pytest.approx(12.0)
     assert least_height(0.1) == 1.0
+
+
+class TestPeaks:
+    @staticmethod
+    def found(hu: Array) -> Peaks:
+        wide = np.zeros((40 + 2 * MARGIN, 40 + 2 * MARGIN), np.float32)
+        wide[MARGIN:-MARGIN, MARGIN:-MARGIN] = hu
+        return find_peaks(wide, MARGIN, 8, 1.0, 50)
+
+    def test_of_a_plateau_there_is_one_in_its_middle(self) -> None:
+        hu = np.zeros((40, 40))
+        hu[19:22, 9:14] = 100.0
+        peaks = self.found(hu)
+        assert (peaks.u.tolist(), peaks.v.tolist()) == ([11], [20])
+        assert (peaks.top.tolist(), peaks.rough_height.tolist()) == ([100.0], [100.0])
+
+    def test_a_rough_height_is_that_above_the_darker_of_two_sides(self) -> None:
+        """At 4 and at 8 pixels, 50 HU on the left and 10 HU on the right."""
+        hu = np.zeros((40, 40))
+        hu[20, 20], hu[20, [12, 16]], hu[20, [24, 28]] = 100.0, 50.0, 10.0
+        peaks = self.found(hu)
+        assert peaks.rough_height[peaks.u == 20].tolist() == [90.0]
 
 
 class TestProminence:
@@ -77,14 +100,16 @@ class TestLikeARod:
         assert self.regions(20.0, most=200.0, rough_height=20.0, top=53.0) == 0
 
 
-def test_a_bump_beside_a_peak_does_not_take_its_place() -> None:
-    """It is part of the region around the higher one."""
-    v, u = np.indices((80, 80))
-    hu = 1000 * np.exp(-((u - 40) ** 2 + (v - 40) ** 2) / 18) + 600 * np.exp(-((u - 45) ** 2 + (v - 40) ** 2) / 2.88)
-    found = regions_by_contrast(hu.astype(np.float32), 2.0, 320.0)
-    assert len(found.height) == 1
-    assert found.height[0] > 800
-    assert found.regions.labels[40, 40] == found.regions.labels[40, 45] == found.regions.label[0]
+def test_of_regions_that_overlap_the_higher_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    lower = _Candidate(50.0, 1.0, 20.0, (np.array([10, 10]), np.array([10, 11])))
+    higher = _Candidate(100.0, 2.0, 60.0, (np.array([10, 10, 11]), np.array([11, 12, 12])))
+    apart = _Candidate(30.0, 3.0, 10.0, (np.array([20]), np.array([5])))
+    monkeypatch.setattr(contrast, "_candidates", lambda *_: ([lower, apart, higher], np.zeros(0, dtype=bool)))
+    regions, height, noise = regions_by_contrast(np.zeros((30, 30), np.float32), 1.0, 20.0)
+    assert (height.tolist(), noise.tolist()) == ([100.0, 30.0], [2.0, 3.0])
+    assert regions.first.tolist() == [[11, 10], [5, 20]]
+    assert regions.extent.tolist() == [[2, 2], [1, 1]]
+    assert regions.labels[[10, 10, 20], [10, 12, 5]].tolist() == [0, *regions.label]
 
 
 class TestParted:
