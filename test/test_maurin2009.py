@@ -11,11 +11,11 @@ from frames import cube_by_hand
 
 from stereoreg_ros import RegistrationOptions, register_spots
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle
+from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import cut, point_line_distances
 from stereoreg_ros.matching import maurin2009
 from stereoreg_ros.matching.hypothesis import UNMATCHED
-from stereoreg_ros.matching.maurin2009 import SUCCESS, Consensus, _one_to_one, samples_for, search
+from stereoreg_ros.matching.maurin2009 import SUCCESS, Consensus, _consensus, _one_to_one, samples_for, search
 from stereoreg_ros.simulation import ScannerSettings, SpotSet, SpotSetSettings, random_spot_set
 from stereoreg_ros.solvers.linear_system import condition_number
 
@@ -84,15 +84,17 @@ class TestRegistration:
     def test_is_selected_by_its_name(self, cube: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
         calls: list[int] = []
 
-        def counted(spots_mm: Array, *given, **named) -> maurin2009.Search:
+        def counted(spots_mm: Array, frame: Frame, noise_mm: float) -> maurin2009.Search:
             calls.append(len(spots_mm))
-            return search(spots_mm, *given, **named)
+            # Three times that of a spot, which is 0.1 pixel of half a millimetre.
+            assert noise_mm == pytest.approx(0.15)
+            return search(spots_mm, frame, noise_mm)
 
         monkeypatch.setattr(maurin2009, "search", counted)
         spots = problem(0, cube).spots_px
         assert register_spots(spots, cube, SCALE, RegistrationOptions(spot_noise_px=NOISE_PX))
         assert calls == []
-        assert register_spots(spots, cube, SCALE, OPTIONS)
+        assert register_spots(spots, cube, SCALE, replace(OPTIONS, frame_tolerance_mm=0.0, scale_tolerance=0.0))
         assert calls == [6]
 
     def test_is_deterministic(self, cube: Frame) -> None:
@@ -154,6 +156,28 @@ class TestSearch:
         assert farthest > 0.8 * math.sqrt(6) * noise_mm, "all that are within reach count"
         position, _ = errors(result.qualified[0].frame_from_slice.inverse(), given.slice_from_frame)
         assert position < 3
+
+    @pytest.mark.parametrize("is_lower", [True, False])
+    def test_a_spot_beyond_a_rods_end_is_not_on_it(self, is_lower: bool, cube: Frame) -> None:
+        """The last rod ends 5 mm before the slice; prolonged it would hit its spot."""
+        start = Pose(rotation_exp(np.array([0.1, -0.15, 0.3])), np.array([120.0, 110.0, 2.0]))
+        cuts = cut(cube, start.rotation, start.translation)
+        ends = cube.points(np.arange(6), cuts.lambdas + (5.0 if is_lower else -5.0))
+        starts, stops = cube.starts.copy(), cube.ends.copy()
+        (starts if is_lower else stops)[5] = ends[5]
+        shortened = replace(cube, starts=starts, ends=stops)
+        best = search(cuts.points_mm, shortened, 0.15).qualified[0]
+        assert [*best.pairs] == [(row, row) for row in range(5)]
+
+    def test_two_spots_on_one_rod_make_no_fifth_inlier(self, cube: Frame) -> None:
+        start = Pose(rotation_exp(np.array([0.1, -0.15, 0.3])), np.array([120.0, 110.0, 2.0]))
+        cuts = cut(cube, start.rotation, start.translation).points_mm
+        four = np.arange(4)
+        doubled = np.concatenate([cuts[:4], cuts[:1] + 0.05])
+        assert _consensus(doubled, cube, four, four, 0.3) is None
+        found = _consensus(cuts[:5], cube, four, four, 0.3)
+        assert found is not None
+        assert [*found.pairs] == [(row, row) for row in range(5)]
 
     def test_draws_as_many_samples_as_planned(self, cube: Frame) -> None:
         result = search(SCALE.to_mm(problem(1, cube).spots_px), cube, 0.15)

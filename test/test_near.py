@@ -11,9 +11,11 @@ import pytest
 from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
-from stereoreg_ros.matching import three_line
-from stereoreg_ros.matching.hypothesis import Found
+from stereoreg_ros.matching import near, three_line
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.near import match_near
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_pose, random_spot_set
@@ -195,6 +197,39 @@ def test_other_matches_of_the_pose_widen_it_near_a_guess_too(monkeypatch: pytest
     assert plain
     assert wide
     np.testing.assert_allclose(wide.covariance, 4 * plain.covariance, rtol=1e-9)
+
+
+def test_what_chance_may_bring_near_a_guess_is_left_to_the_search_without() -> None:
+    truth = random_pose(np.random.default_rng(14), CUBE, SCANNER)
+    mm = SCALE.to_mm(project(CUBE, truth, SCALE)[0])
+    spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2, Tolerances.none(CUBE))
+    prior = Prior(np.eye(3), np.pi)
+    found = match_near(spots, CUBE, prior, RegistrationOptions(), truth)
+    assert found is not None
+    (best,) = found.hypotheses
+    for allowed, is_found in ((best.log10_false_alarms + 0.1, True), (best.log10_false_alarms - 0.1, False)):
+        options = RegistrationOptions(max_log10_false_alarms=allowed)
+        assert (match_near(spots, CUBE, prior, options, truth) is not None) is is_found
+
+
+def test_where_the_nearest_spots_leave_a_rod_out_that_must_show_others_are_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth = random_pose(np.random.default_rng(14), CUBE, SCANNER)
+    mm = SCALE.to_mm(project(CUBE, truth, SCALE)[0])
+    spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2, Tolerances.none(CUBE))
+    prior = Prior(np.eye(3), np.pi)
+
+    def lacking(*given) -> list[Hypothesis]:
+        (one,) = settle(*given)
+        spot_of_line = one.spot_of_line.copy()
+        spot_of_line[2] = UNMATCHED
+        return [replace(one, spot_of_line=spot_of_line, missing=1)]
+
+    monkeypatch.setattr(near, "settle", lacking)
+    found = match_near(spots, CUBE, prior, RegistrationOptions(), truth)
+    assert found is not None
+    assert [(one.inliers, one.missing) for one in found.hypotheses] == [(6, 0)]
 
 
 def test_where_twins_are_sought_in_vain_for_long_there_is_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 from stereoreg_ros import RegistrationOptions, load_frame
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.matching.consensus import count_missing
+from stereoreg_ros.matching.consensus import MISSING_COST, SHARED_SPOT_MM, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
-from stereoreg_ros.matching.other_scale import with_other_scale
+from stereoreg_ros.matching.other_scale import _evidence, _with_one_more, with_other_scale
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots, whitening_of
 from stereoreg_ros.matching.tolerances import Tolerances
@@ -98,6 +99,33 @@ def test_more_than_fifteen_per_cent_is_believed_of_no_scale(share: float, too_la
     assert (other.evidence > SURE) is (abs(too_large) < 0.15)
 
 
+@pytest.mark.parametrize(("beyond_mm", "is_found"), [(0.5, True), (2.5, False)])
+def test_a_spot_beyond_a_rods_end_is_not_on_it(beyond_mm: float, is_found: bool) -> None:
+    frame = load_frame("leksell_ct9")
+    scene = wrong_spacing(np.random.default_rng([5, 0]), frame, AROUND, share=0.05)
+    assert scene.truth is not None
+    lambdas = cut(frame, scene.truth.rotation, scene.truth.translation).lambdas
+    ends = frame.ends.copy()
+    ends[4] = frame.points([4], lambdas[4] - np.array([beyond_mm]))[0]
+    scene = replace(scene, frame=replace(frame, ends=ends))
+    spots, matches = spots_of(scene), true_matches(scene)
+    matches[4] = UNMATCHED
+    other = with_other_scale(explained(scene, spots, matches), spots, scene.frame, PRIOR)
+    assert (other is not None and other.evidence > SURE) is is_found
+
+
+def test_what_no_scale_explains_is_none() -> None:
+    """A spot 12 mm from the place of the rod that has none, where nothing else is wrong."""
+    frame = load_frame("leksell_ct9")
+    scene = true_scene(np.random.default_rng(6), frame, AROUND, most_false=0)
+    spots, matches = spots_of(scene), true_matches(scene)
+    points = spots.mm.copy()
+    points[matches[4]] += [7.0, 10.0]
+    moved = spots._replace(mm=points)
+    matches[4] = UNMATCHED
+    assert with_other_scale(explained(scene, moved, matches), moved, frame, PRIOR) is None
+
+
 def test_where_rods_meet_the_one_may_have_taken_the_spot_of_the_other() -> None:
     frame = load_frame("leksell_ct9")
     found = 0
@@ -128,6 +156,49 @@ def test_a_missing_rod_and_false_spots_hardly_ever_look_so(name: str) -> None:
         believed += other is not None and other.evidence > SURE
     # Once in a thousand by the bound on it.
     assert believed <= 1
+
+
+def test_evidence_is_the_likelihood_of_all_residuals_at_once_with_its_room_and_the_cost_of_missing_rods() -> None:
+    """By the covariance of all residuals together, in which the errors of the scale are shared."""
+    frame = load_frame("leksell_ct9")
+    scene = true_scene(np.random.default_rng(7), frame, AROUND, most_false=3)
+    spots, matches = spots_of(scene), true_matches(scene)
+    spots = spots._replace(tolerances=spots.tolerances.with_scale_known_to(0.05))
+    matches[4] = UNMATCHED
+    best = explained(scene, spots, matches)
+    assert best.missing == 1
+    cuts = cut(frame, best.rotation[None], best.translation[None])
+    used = np.flatnonzero(matches != UNMATCHED)
+    own = spots.match_covariances(frame, cuts, matches[None])[0, used]
+    together = np.zeros((2 * len(used), 2 * len(used)))
+    for row, covariance in enumerate(own):
+        together[2 * row : 2 * row + 2, 2 * row : 2 * row + 2] = covariance
+    moved = spots.tolerances.common(frame, cuts, spots.mm[matches][None], (matches != UNMATCHED)[None])[0, used]
+    moved = moved.reshape(2 * len(used), -1)
+    together += moved @ moved.T
+    expected = -len(used) * math.log(2 * math.pi * spots.clutter_density(frame))
+    expected -= 0.5 * np.linalg.slogdet(together)[1] + 0.5 * np.linalg.slogdet(best.information)[1]
+    expected -= best.chi_square / 2 + MISSING_COST
+    found = _evidence(spots, frame, cuts, matches[None], np.array([best.chi_square]), best.information[None])
+    assert found[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_completions_give_each_rod_without_a_spot_one_left_over_or_that_of_a_rod_it_meets() -> None:
+    """The pose has the fifth rod beside the first; the spot left over may be either's then."""
+    frame = load_frame("leksell_ct9")
+    scene = true_scene(np.random.default_rng(8), frame, AROUND, most_false=0)
+    spots, matches = spots_of(scene), true_matches(scene)
+    best = explained(scene, spots, matches)
+    points = cut(frame, best.rotation, best.translation).points_mm
+    moved = spots.mm.copy()
+    moved[matches[0]] = points[4] + [SHARED_SPOT_MM - 0.1, 0.0]
+    moved[matches[1]] = points[4] + [0.0, SHARED_SPOT_MM + 0.1]
+    without = matches.copy()
+    without[4] = UNMATCHED
+    found = _with_one_more(replace(best, spot_of_line=without), spots._replace(mm=moved), frame)
+    exchanged = matches.copy()
+    exchanged[[0, 4]] = matches[[4, 0]]
+    assert found.tolist() == [matches.tolist(), exchanged.tolist()]
 
 
 def test_nothing_left_over_is_nothing_to_try() -> None:

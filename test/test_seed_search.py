@@ -195,3 +195,17 @@ class TestTriples:
 
     def test_a_spot_is_given_to_one_rod_only(self) -> None:
         assert self.triples([0.0, 0.0, 0.0], [4.5, 4.5, 4.5], self.OPEN) == []
+
+
+class TestPrior:
+    def test_seeds_may_be_ten_degrees_farther_off_than_poses(self) -> None:
+        assert Prior(np.eye(3), np.radians(30.0)).seed_angle == pytest.approx(np.radians(40.0))
+
+    def test_of_some_spots_each_rod_keeps_those_within_its_reach(self) -> None:
+        reach = np.array([[True, False, False, True], [False, True, False, False], [True, True, False, False]])
+        prior = Prior(np.eye(3), 0.5, Near(np.zeros(3), 10.0, reach))
+        some = prior.only(np.array([1, 3])).near
+        assert some is not None
+        np.testing.assert_array_equal(some.spots_of_line, reach[:, [1, 3]])
+        everywhere = Prior(np.eye(3), 0.5)
+        assert everywhere.only(np.array([1])) is everywhere

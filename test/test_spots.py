@@ -157,7 +157,7 @@ class TestWhatIsASpot:
         """A bright wall around three quarters of it: the level is that of the rest."""
         image = blank()
         image[22:39, 32:49] = 3000
-        image[26:35, 36:45] = 40
+        image[27:34, 37:44] = 40
         image[31:39, 41:49] = 40
         image[29:32, 39:42] = 5000
         options = RegistrationOptions(threshold=2000.0, max_spot_area_mm2=5.0)
