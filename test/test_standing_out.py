@@ -8,8 +8,9 @@ import pytest
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.spots import contrast
 from stereoreg_ros.spots.contrast import _Candidate, _regions, regions_by_contrast
+from stereoreg_ros.spots.finding import _surroundings
 from stereoreg_ros.spots.peaks import Peaks, find_peaks
-from stereoreg_ros.spots.prominence import Prominence, SmoothSlice, least_height, prominences
+from stereoreg_ros.spots.prominence import Prominence, SmoothSlice, _noise, least_height, prominences
 from stereoreg_ros.spots.regions import Regions, parted, regions_above
 
 MARGIN = 12
@@ -22,6 +23,19 @@ def peak_at(u: int, v: int, top: float, rough_height: float) -> Peaks:
 def test_least_height_is_six_times_the_noise_and_no_less_than_a_unit() -> None:
     assert least_height(2.0) == pytest.approx(12.0)
     assert least_height(0.1) == 1.0
+
+
+def test_the_surroundings_of_a_spot_are_told_by_their_median_and_by_how_far_most_are_from_it() -> None:
+    """Around the first one 10 to 18 HU, and 1000 HU once; around the second nothing."""
+    patches = np.full((2, 5, 5), 7.0, np.float32)
+    patches[0, 0], patches[0, 1, 0] = [18.0, 10.0, 14.0, 16.0, 12.0], 1000.0
+    patches[1, 2, 2] = -3.0
+    ring = np.zeros((2, 5, 5), dtype=bool)
+    ring[0, 0] = ring[0, 1, 0] = True
+    level, noise_hu2 = _surroundings(patches, ring)
+    # The lower of the two in the middle.
+    assert level.tolist() == [14.0, -3.0]
+    assert noise_hu2 == pytest.approx([(2 / 0.6745) ** 2, 0.0])
 
 
 class TestPeaks:
@@ -44,6 +58,18 @@ class TestPeaks:
         hu[20, 20], hu[20, [12, 16]], hu[20, [24, 28]] = 100.0, 50.0, 10.0
         peaks = self.found(hu)
         assert peaks.rough_height[peaks.u == 20].tolist() == [90.0]
+
+
+@pytest.mark.parametrize(
+    ("by_column", "by_row", "least"), [(1.0, 20.0, 3.0), (20.0, 1.0, 3.0), (10.0, 7.0, 6.0), (10.0, -7.0, 6.0)]
+)
+def test_noise_is_what_pixels_differ_by_in_the_direction_in_which_they_do_least(
+    by_column: float, by_row: float, least: float
+) -> None:
+    """Of a slope: three pixels apart along a row or a column, two by two along either diagonal."""
+    v, u = np.indices((21, 21))
+    square = (by_column * u + by_row * v).astype(np.float32)
+    assert _noise(square[None]) == pytest.approx([least / 0.954])
 
 
 class TestProminence:
