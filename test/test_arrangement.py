@@ -318,7 +318,7 @@ def answer(solve: Solve, frame: Frame, spots: Array) -> tuple[Any, DegenerateArr
         return None, refused
 
 
-@settings(max_examples=2000, deadline=None, derandomize=True, database=None)
+@settings(max_examples=700, deadline=None, derandomize=True, database=None)
 @given(
     kind=st.sampled_from(KINDS),
     n=st.integers(3, 8),

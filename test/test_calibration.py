@@ -75,7 +75,7 @@ class TestAccepted:
     def test_standard_errors_are_those_of_many_trials(self, cube: Frame, slices: int) -> None:
         rng = np.random.default_rng(slices)
         nees = []
-        trials = 60 if slices == 1 else 24
+        trials = {1: 60, 3: 24, 10: 8}[slices]
         for _ in range(trials):
             found = calibrate(sightings(rng, cube, slices), cube, TRUE, EXACT_FRAME)
             assert isinstance(found, Calibration), found.message
@@ -91,11 +91,10 @@ class TestAccepted:
 
     def test_forty_three_slices_are_good_to_a_thousandth(self, cube: Frame) -> None:
         rng = np.random.default_rng(43)
-        for _ in range(3):
-            found = calibrate(sightings(rng, cube, 43), cube, TRUE, EXACT_FRAME)
-            assert isinstance(found, Calibration), found.message
-            assert abs(found.scale.sx / TRUE.sx - 1) <= 1e-3
-            assert abs(found.scale.sy / TRUE.sy - 1) <= 1e-3
+        found = calibrate(sightings(rng, cube, 43), cube, TRUE, EXACT_FRAME)
+        assert isinstance(found, Calibration), found.message
+        assert abs(found.scale.sx / TRUE.sx - 1) <= 1e-3
+        assert abs(found.scale.sy / TRUE.sy - 1) <= 1e-3
 
     def test_exact_spots(self, cube: Frame) -> None:
         found = calibrate(sightings(np.random.default_rng(2), cube, 2, noise_px=0.0), cube, TRUE, OPTIONS)
@@ -177,7 +176,7 @@ class TestFrameAsBuilt:
         """About 0.2 % of a cube of 60 mm, which more slices do not make less."""
         rng = np.random.default_rng(100 + slices)
         nees = []
-        trials = 40 if slices == 1 else 16
+        trials = 40 if slices == 1 else 8
         for _ in range(trials):
             found = calibrate(sightings(rng, as_built(rng, cube, 0.2), slices), cube, TRUE, OPTIONS)
             assert isinstance(found, Calibration), found.message

@@ -29,7 +29,7 @@ from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_spot_set
 
 SCANNER = ScannerSettings(shape=(640, 640))
-PROBLEMS = 10
+PROBLEMS = 6
 AREA_MM2 = 65536.0
 ANYWHERE = Prior(np.eye(3), math.pi)
 STEPS = 30
@@ -188,9 +188,9 @@ def test_no_pose_of_four_rods_is_missed(frame: Frame) -> None:
     # From one triple of these rods 94, 17 and 23 of 1000 were, in slices drawn in the same way.
     settings = SpotSetSettings(SCANNER, 4, 0, 0.3, gaussian=True)
     rng = np.random.default_rng(1)
-    sets = [random_spot_set(rng, frame, settings) for _ in range(120)]
+    sets = [random_spot_set(rng, frame, settings) for _ in range(60)]
     missed = [is_missed(frame, settings, one.spots_px, one.slice_from_frame) for one in sets]
-    assert missed.count(None) < 30
+    assert missed.count(None) < 15
     assert missed.count(True) == 0
 
 

@@ -449,7 +449,7 @@ class TestSlices:
         rng = np.random.default_rng(1)
         around = Surroundings(SCANNER, max_rotation_deg=30.0)
         reasons = []
-        for _ in range(12):
+        for _ in range(6):
             scene = contradicted_prior(rng, frame, around, turn_deg=180.0)
             options = RegistrationOptions(max_rotation_deg=30.0)
             result = register_spots(

@@ -44,7 +44,7 @@ def test_five_rods_among_thirty_spots_are_sure_near_the_pose_before(mm: float, d
     settings = SpotSetSettings(SCANNER, visible_rods=5, false_spots=25, noise_px=0.5)
     options = replace(PERFECT, spot_noise_px=settings.noise_std_px)
     told, untold = 0, 0
-    for _ in range(60):
+    for _ in range(30):
         problem = random_spot_set(rng, CUBE, settings)
         guess = moved(rng, problem.slice_from_frame, mm, degrees)
         result = register_spots(problem.spots_px, CUBE, SCALE, options, previous=guess)
@@ -52,8 +52,8 @@ def test_five_rods_among_thirty_spots_are_sure_near_the_pose_before(mm: float, d
         if result:
             assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame)
         untold += bool(register_spots(problem.spots_px, CUBE, SCALE, options))
-    assert told >= 59
-    assert untold < 30
+    assert told >= 29
+    assert untold < 15
 
 
 def test_the_guess_is_of_the_frame_in_the_scanner_whatever_the_slices_plane() -> None:
@@ -134,7 +134,7 @@ def test_a_wrong_guess_does_no_harm() -> None:
 
 def test_clutter_is_not_taken_for_the_frame_that_was_there() -> None:
     rng = np.random.default_rng(4)
-    for _ in range(150):
+    for _ in range(60):
         guess = random_pose(rng, CUBE, SCANNER)
         spots = rng.uniform(0, 512, (rng.integers(5, 40), 2))
         assert not register_spots(spots, CUBE, SCALE, previous=guess)

@@ -73,7 +73,7 @@ def test_result_does_not_depend_on_the_order_of_the_spots_and_is_deterministic(c
 def test_false_spots_and_missing_rods(cube, visible, false_spots, noise_px, least_accepted):
     rng = np.random.default_rng(100 * visible + false_spots)
     settings = SpotSetSettings(SCANNER, visible, false_spots, noise_px)
-    trials, accepted = 100, 0
+    trials, accepted = 50, 0
     for _ in range(trials):
         problem = random_spot_set(rng, cube, settings)
         result = register_spots(problem.spots_px, cube, SCALE, replace(PERFECT, spot_noise_px=0.3))
@@ -92,7 +92,7 @@ def test_false_spots_and_missing_rods(cube, visible, false_spots, noise_px, leas
 def test_clutter_alone_is_never_accepted(name):
     rng = np.random.default_rng(4)
     frame = load_frame(name)
-    for _ in range(40):
+    for _ in range(25):
         spots = rng.uniform(0, 512, (rng.integers(5, 31), 2))
         result = register_spots(spots, frame, SCALE)
         assert not result
@@ -352,7 +352,7 @@ class TestPlausibility:
     """The stated noise is judged by the residual: its chi-square, both ways."""
 
     @staticmethod
-    def outcomes(cube: Frame, told_px: float, trials: int = 150) -> list[str]:
+    def outcomes(cube: Frame, told_px: float, trials: int = 80) -> list[str]:
         rng = np.random.default_rng(21)
         outcomes: list[str] = []
         for _ in range(trials):
@@ -396,7 +396,7 @@ class TestPlausibility:
     def test_chi_square_is_that_of_its_degrees_of_freedom(self, cube):
         rng = np.random.default_rng(22)
         values = []
-        for _ in range(300):
+        for _ in range(150):
             problem = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 0, 0.2, gaussian=True))
             result = register_spots(problem.spots_px, cube, SCALE, replace(PERFECT, spot_noise_px=0.2))
             # Some are refused for it.

@@ -8,7 +8,7 @@ from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.geometry.pose import rotation_angle
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 
-SLICES = 200
+SLICES = 100
 
 
 def test_cube_with_false_spots_and_a_missing_rod():

@@ -111,7 +111,7 @@ def test_no_rod_is_lost_where_the_thickness_is_known(thickness_mm: float, thresh
     scanner = ScannerSettings(slice_thickness_mm=thickness_mm, false_spots=4, shape=(320, 320))
     options = RegistrationOptions(threshold=threshold)
     rng = np.random.default_rng(9)
-    for _ in range(12):
+    for _ in range(6):
         placed = PlacedFrame(frame, random_pose(rng, frame, scanner))
         ct_slice = render_slice([placed], scanner, rng)
         without = register_slice(ct_slice, frame, options)
@@ -144,7 +144,7 @@ def test_the_pose_is_as_sure_as_its_spots_are() -> None:
     frame = load_frame("cube6")
     rng = np.random.default_rng(11)
     nees = []
-    trials = 150
+    trials = 75
     for _ in range(trials):
         truth = random_spot_set(rng, frame, SpotSetSettings(ScannerSettings(), 6, 0, 0.0))
         covariances = noisy(rng, 6)

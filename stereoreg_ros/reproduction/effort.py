@@ -31,4 +31,4 @@ class Effort:
 _LEVELS_PX: Final = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 
 FULL: Final = Effort("full", _LEVELS_PX, 100, 3000, 43, 31, 15, (0, 1, 4, 8, 24), 60.0)
-QUICK: Final = Effort("quick", (0.0, 0.5, 1.5), 100, 150, 15, 11, 3, (0, 4), 0.5)
+QUICK: Final = Effort("quick", (0.0, 0.5, 1.5), 100, 150, 9, 7, 3, (0, 4), 0.5)
