@@ -42,6 +42,14 @@ def test_is_the_cramer_rao_bound() -> None:
         np.testing.assert_allclose(found.covariances[0, row], bound, rtol=1e-6, atol=1e-12)
 
 
+def test_slices_are_taken_as_the_registration_assumes() -> None:
+    scale = PixelScale(0.4, 0.7)
+    options = RegistrationOptions(
+        spot_noise_px=0.25, slice_thickness_mm=2.5, frame_tolerance_mm=0.35, scale_tolerance=0.003
+    )
+    assert Imaging.of(scale, options) == Imaging(scale, 0.25, 2.5, 0.35, 0.003)
+
+
 def test_a_rod_left_out() -> None:
     frame, poses = load_frame("cube6"), level(4)
     less = expected(Layouts.of(frame), poses, UPRIGHT, left_out=2)
