@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from stereoreg_ros.reception.bounded_socket import MAX_PDU_BYTES, BoundedSocket, Limits
+from stereoreg_ros.reception.ending_state_machine import EndingStateMachine
 
 ASSOCIATION_S, NETWORK_S = 5.0, 30.0
 
@@ -18,7 +19,7 @@ class Client:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, part: int, pause_s: float, established: bool) -> None:
         self.now_s, self._part, self._pause_s = 0.0, part, pause_s
-        self.sent, self.timeouts = b"", list[float]()
+        self.sent, self.timeouts, self.is_open = b"", list[float](), True
         monkeypatch.setattr(
             "stereoreg_ros.reception.bounded_socket.time", SimpleNamespace(monotonic=lambda: self.now_s)
         )
@@ -29,6 +30,9 @@ class Client:
         self.socket = BoundedSocket(association, connection, Limits(2**20, 1, ASSOCIATION_S, NETWORK_S))
         # What it answers goes to nobody.
         monkeypatch.setattr(BoundedSocket, "send", lambda _, content: setattr(self, "sent", content))
+
+    def close(self) -> None:
+        self.is_open = False
 
     def settimeout(self, seconds: float) -> None:
         self.timeouts.append(seconds)
@@ -72,3 +76,16 @@ def test_a_pdu_may_be_as_long_as_is_announced_to_clients_with_its_header_and_no_
     with pytest.raises(OSError, match="a PDU of 262151 bytes was announced, expected at most 262144"):
         client.socket.recv(MAX_PDU_BYTES + 7)
     assert client.sent
+
+
+def test_a_pdu_that_makes_no_sense_where_it_comes_ends_the_association_and_closes_its_connection(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client = Client(monkeypatch, 1, 0.0, True)
+    ended: list[bool] = []
+    dul: Any = SimpleNamespace(socket=client.socket, assoc=client.socket.assoc, kill_dul=lambda: ended.append(True))
+    machine = EndingStateMachine(dul)
+    # Data, before there is a connection at all.
+    machine.do_action("Evt10")
+    assert not client.is_open
+    assert ended == [True]

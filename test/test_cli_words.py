@@ -400,3 +400,21 @@ def test_what_cannot_be_written_and_what_is_interrupted_do_not_end_well(
     monkeypatch.setattr(Path, "write_bytes", write)
     register.results = [accepted()]
     assert cli.main(["register", "--frame", "cube6", "--overlay", str(tmp_path), str(path)]) == code
+
+
+def test_behind_a_slice_whose_pixels_cannot_be_read_its_series_goes_on(
+    register: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for z in range(3):
+        pixels = {"PixelData": IMAGE.tobytes()[:90]} if z == 1 else {}
+        write_slice(tmp_path / f"{z}.dcm", IMAGE, float(z), **pixels)
+    register.results = [accepted(), refused("no_consensus")]
+    assert cli.main(["register", "--frame", "cube6", "--json", str(tmp_path)]) == 1
+    output = capsys.readouterr()
+    records = [json.loads(line) for line in output.out.splitlines()]
+    assert [(Path(one["file"]).name, one["reason"]) for one in records] == [
+        ("0.dcm", ""),
+        ("1.dcm", "bad_image"),
+        ("2.dcm", "no_consensus"),
+    ]
+    assert "1.dcm: Pixel Data (7FE0,0010) has 90 bytes, expected 96 bytes" in output.err

@@ -169,6 +169,14 @@ class TestReceived:
         # A file that somebody chose may do without.
         assert not read_slice(path).header.has_plane
 
+    def test_every_frame_of_an_enhanced_ct_says_how_its_values_become_hu(self, tmp_path: Path) -> None:
+        path = write_enhanced_ct(tmp_path / "a.dcm", [IMAGE, IMAGE], [5.0, -7.0])
+        dataset = pydicom.dcmread(path)
+        del dataset.PerFrameFunctionalGroupsSequence[1].PixelValueTransformationSequence
+        dataset.save_as(path)
+        with pytest.raises(DicomError, match=r"Rescale Slope \(0028,1053\) is missing, expected that of a CT image"):
+            received(path)
+
     def test_it_bears_the_uid_that_it_was_announced_with(self, tmp_path: Path) -> None:
         content = write_slice(tmp_path / "a.dcm", IMAGE, SOPInstanceUID="1.2.3").read_bytes()
         for announced in ("1.2.3", ""):

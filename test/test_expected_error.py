@@ -194,6 +194,11 @@ class TestMeetings:
         assert -12 <= poses.heights_mm.min() < -11
         assert 6 < poses.heights_mm.max() <= 7
 
+    def test_no_direction_of_the_normal_is_met_more_often_than_another(self) -> None:
+        """Of the cap of a sphere, the heights above its rim are all as frequent."""
+        poses = meetings(256, 5, np.zeros(3), np.array([0.0, 0.0]), 60.0)
+        np.testing.assert_allclose(np.sort(poses.rotations[:, 2, 2]), 0.5 + (np.arange(256) + 0.5) / 512, atol=0.004)
+
     def test_any_turn_where_nothing_is_known(self) -> None:
         poses = meetings(400, 5, np.zeros(3), np.array([0.0, 0.0]), 30.0)
         turns = np.arctan2(poses.rotations[:, 1, 0], poses.rotations[:, 0, 0])

@@ -299,7 +299,10 @@ def test_frames_are_sound():
             for other in range(one):
                 gaps = points[:, None, one] - points[None, :, other]
                 assert np.linalg.norm(gaps, axis=-1).min() > 4
-    assert first_rods(EIGHT_RODS, 5).line_names == tuple("abcde")
+    five = first_rods(EIGHT_RODS, 5)
+    assert five.line_names == tuple("abcde")
+    assert (five.starts == EIGHT_RODS.starts[:5]).all()
+    assert (five.ends == EIGHT_RODS.ends[:5]).all()
     small = shrunk(FIRST_CUBE, 0.5)
     assert (small.ends == 0.5 * FIRST_CUBE.ends).all()
     assert (small.diameters == FIRST_CUBE.diameters).all()
