@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,10 @@ from dicom_files import write_slice
 from stereoreg_ros import RegistrationOptions, cli, load_frame
 from stereoreg_ros.calibration import Calibration
 from stereoreg_ros.calibration_series import SeriesScale, SliceScale
+from stereoreg_ros.cli.inspect import USED_OPTIONS
+from stereoreg_ros.design.expected_error import Imaging
+from stereoreg_ros.design.proposal import Proposal
+from stereoreg_ros.design.search import Wish
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.options import CalibrationOptions
@@ -263,3 +269,152 @@ class TestCalibrate:
         )
         self.call(monkeypatch, tmp_path)
         assert self.given == (RegistrationOptions(), CalibrationOptions())
+
+
+# As `inspect` and `design` take them: every option with another value than its default.
+OPTIONS = RegistrationOptions(
+    spot_noise_px=0.25,
+    frame_tolerance_mm=0.0,
+    scale_tolerance=0.003,
+    slice_thickness_mm=2.5,
+    min_inliers=5,
+    max_log10_false_alarms=-3.5,
+    nominal_orientation=(0.0, 1.0, 0.0, 0.0),
+    max_rotation_deg=20.0,
+    target_in_frame_mm=(1.0, -2.0, 3.0),
+    max_target_error_mm=2.25,
+)
+
+
+def flags_of(options: RegistrationOptions) -> list[str]:
+    flags = []
+    for name in USED_OPTIONS:
+        value = asdict(options)[name]
+        flags += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else [value])]
+    return flags
+
+
+def test_inspect_passes_on_all_that_it_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[tuple[Any, ...]] = []
+
+    def inspect_frame(*told: Any) -> None:
+        given.append(told[:-1])
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr("stereoreg_ros.cli.inspect.inspect_frame", inspect_frame)
+    slices = ["--pixel-spacing", "0.4", "0.7", "--tilt", "12", "--poses", "34", "--seed", "5"]
+    assert cli.main(["inspect", "--frame", "cube5", *slices, *flags_of(OPTIONS)]) == 2
+    assert capsys.readouterr().err == "stereoreg: seen enough\n"
+    ((frame, *others),) = given
+    assert frame.name == "cube5"
+    assert others == [OPTIONS, PixelScale(0.4, 0.7), 12.0, 34, 5]
+
+
+class TestDesign:
+    """With a proposal that was made by hand in place of a search."""
+
+    TOLD = (
+        *("--name", "mine", "--lines", "5", "--envelope", "30", "40", "80", "--diameter", "0.5", "--gap", "2.5"),
+        *("--pixel-spacing", "0.4", "0.7", "--tilt", "12", "--seed", "3", "--chains", "7"),
+        *flags_of(OPTIONS),
+    )
+
+    def call(
+        self, monkeypatch: pytest.MonkeyPatch, folder: Path, *flags: str, ambiguous: int = 0, interrupted: bool = False
+    ) -> int:
+        self.asked: tuple[Any, ...] = ()
+
+        def propose(*asked: Any) -> Proposal:
+            self.asked = asked[:-1]
+            return Proposal(FRAME, 0.25, ambiguous, 20, interrupted)
+
+        monkeypatch.setattr("stereoreg_ros.cli.design.propose", propose)
+        monkeypatch.setattr("stereoreg_ros.cli.design.inspected", lambda *_: None)
+        monkeypatch.setattr("stereoreg_ros.cli.design.table_of", lambda _: ["a table"])
+        monkeypatch.setattr("stereoreg_ros.cli.design.draw", lambda *_: None)
+        return cli.main(["design", *flags, "--output", str(folder)])
+
+    def test_all_that_it_is_told_is_passed_on(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        assert self.call(monkeypatch, tmp_path, *self.TOLD) == 0
+        wish, *others = self.asked
+        assert isinstance(wish, Wish)
+        assert (wish.envelope.size_mm, wish.envelope.gap_mm) == ((30.0, 40.0, 80.0), 2.5)
+        assert wish.diameters_mm == (0.5,) * 5
+        assert wish.imaging == Imaging.of(PixelScale(0.4, 0.7), OPTIONS)
+        assert wish.target_mm == (1.0, -2.0, 3.0)
+        # A quarter of the box's height, where nothing is told.
+        assert (wish.largest_tilt_deg, wish.largest_height_mm) == (12.0, 20.0)
+        assert others == ["mine", OPTIONS, 3, 7]
+
+    @pytest.mark.parametrize("height", [0.0, 7.5])
+    def test_a_height_may_be_told_even_none_at_all(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, height: float
+    ) -> None:
+        assert self.call(monkeypatch, tmp_path, *self.TOLD, "--height", str(height)) == 0
+        assert self.asked[0].largest_height_mm == height
+
+    def test_the_call_that_stands_in_the_file_asks_for_the_same(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        assert self.call(monkeypatch, tmp_path, *self.TOLD, "--height", "0") == 0
+        wish, *others = self.asked
+        lines = [line[2:] for line in (tmp_path / "mine.yaml").read_text().splitlines() if line.startswith("# ")]
+        assert lines[0].startswith("6 rods; 95 % target error 0.250 mm over the slices")
+        assert "0 of 20 spot sets ambiguous" in lines[0]
+        begin = next(number for number, line in enumerate(lines) if line.startswith("stereoreg design"))
+        end = next(number for number, line in enumerate(lines) if line.startswith("Axes"))
+        called = shlex.split(" ".join(lines[begin:end]))
+        assert self.call(monkeypatch, tmp_path, *called[2:]) == 0
+        again = self.asked[0]
+        assert self.asked[1:] == tuple(others)
+        assert (again.envelope, again.diameters_mm, again.imaging) == (wish.envelope, wish.diameters_mm, wish.imaging)
+        assert (again.target_mm, again.largest_tilt_deg, again.largest_height_mm) == (wish.target_mm, 12.0, 0.0)
+
+    def test_an_ambiguous_frame_is_written_and_complained_of(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert self.call(monkeypatch, tmp_path, *self.TOLD, ambiguous=1) == 1
+        assert {path.name for path in tmp_path.iterdir()} == {"mine.yaml", "mine.txt"}
+        assert "another pose explains 1 of 20 spot sets as well" in capsys.readouterr().err
+
+    def test_an_interrupted_search_leaves_its_best_and_no_report(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert self.call(monkeypatch, tmp_path, *self.TOLD, interrupted=True) == 130
+        assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+        assert "mine.yaml is the best layout so far, not tried for ambiguous poses" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("raised", "code"), [(OSError(28, "No space left on device"), 1), (KeyboardInterrupt(), 130)])
+def test_what_cannot_be_written_and_what_is_interrupted_do_not_end_well(
+    register: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, raised: BaseException, code: int
+) -> None:
+    path = write_slice(tmp_path / "one.dcm", IMAGE)
+
+    def write(*_: object) -> None:
+        raise raised
+
+    monkeypatch.setattr("stereoreg_ros.cli.register.draw_overlay", lambda *_: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr(Path, "write_bytes", write)
+    register.results = [accepted()]
+    assert cli.main(["register", "--frame", "cube6", "--overlay", str(tmp_path), str(path)]) == code
+
+
+def test_behind_a_slice_whose_pixels_cannot_be_read_its_series_goes_on(
+    register: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for z in range(3):
+        pixels = {"PixelData": IMAGE.tobytes()[:90]} if z == 1 else {}
+        write_slice(tmp_path / f"{z}.dcm", IMAGE, float(z), **pixels)
+    register.results = [accepted(), refused("no_consensus")]
+    assert cli.main(["register", "--frame", "cube6", "--json", str(tmp_path)]) == 1
+    output = capsys.readouterr()
+    records = [json.loads(line) for line in output.out.splitlines()]
+    assert [(Path(one["file"]).name, one["reason"]) for one in records] == [
+        ("0.dcm", ""),
+        ("1.dcm", "bad_image"),
+        ("2.dcm", "no_consensus"),
+    ]
+    assert "1.dcm: Pixel Data (7FE0,0010) has 90 bytes, expected 96 bytes" in output.err

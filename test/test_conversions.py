@@ -58,6 +58,13 @@ def test_rescale():
     assert np.array_equal(hu, [[-1024, 1024, 7166]])
 
 
+def test_an_intercept_alone_is_added_and_a_slope_alone_multiplied():
+    """Most scanners write a slope of 1."""
+    image = image_of(np.array([[0, 1024, 4095]]), "16UC1")
+    assert np.array_equal(conversions.hu_from_image(image, 1.0, -1024.0), [[-1024, 0, 3071]])
+    assert np.array_equal(conversions.hu_from_image(image, 2.0), [[0, 2048, 8190]])
+
+
 def test_float_pixels_are_not_copied():
     image = image_of(np.arange(12.0).reshape(3, 4), "32FC1", padding=8)
     assert np.shares_memory(conversions.hu_from_image(image), np.frombuffer(image.data, np.uint8))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,41 @@ def test_an_image_is_not_blamed_for_another_end_of_the_decoder(seconds: float):
         read_slice(ENDLESS)
     killer.join()
     assert decoder_pid() != before
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(300, 200), (8192, 8192)])
+def test_an_image_has_the_more_time_the_more_pixels_it_has(monkeypatch, rows: int, columns: int):
+    asked: list[float] = []
+
+    class Refusing:
+        def ask(self, _messages: tuple[bytes, ...], limit_s: float) -> bytes:
+            asked.append(limit_s)
+            return b"eno image"
+
+    monkeypatch.setattr(decoding, "_decoder", Refusing)
+    dataset = pydicom.dcmread(WHOLE)
+    dataset.Rows, dataset.Columns = rows, columns
+    with pytest.raises(decoding.DecodingError, match=r"^no image$"):
+        decoding.decoded(dataset)
+    assert asked == [pytest.approx(1.5 + 1e-6 * rows * columns)]
+
+
+def test_what_a_decoder_prints_does_not_come_between_the_answers():
+    program = f"""
+import os, runpy, sys
+sys.argv[0] = {str(decoding._PROGRAM)!r}
+import pydicom.dataset
+pydicom.dataset.Dataset.pixel_array = property(lambda self: (print("noise", flush=True), os.write(1, b"noise"), [7])[2])
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+    elements = b'{"TransferSyntaxUID": "1.2.840.10008.1.2.5", "undefined_length": true, "Rows": 1}'
+    messages = b"".join(len(one).to_bytes(8, "big") + one for one in (elements, b"pixels"))
+    done = subprocess.run([sys.executable, "-c", program], input=messages, capture_output=True, timeout=60, check=True)
+    assert done.stdout[:8] == bytes(8)
+    length = int.from_bytes(done.stdout[8:16], "big")
+    assert len(done.stdout) == 16 + length
+    assert done.stdout[16:17] == b"a"
+    assert np.load(BytesIO(done.stdout[17:])).tolist() == [7]
 
 
 @pytest.mark.parametrize("kill", [False, True])

@@ -211,6 +211,14 @@ def test_flipped_bytes_never_raise_anything_else(tmp_path):
             assert np.isfinite(read_slice(damaged).ct_slice.hu).all()
 
 
+def test_what_lacks_the_letters_is_no_dicom_however_long_it_is(tmp_path):
+    content = bytearray(write_slice(tmp_path / "a.dcm", IMAGE).read_bytes())
+    content[128:132] = b"DICN"
+    (tmp_path / "a.dcm").write_bytes(content)
+    with pytest.raises(DicomError, match="not a DICOM file: found no letters DICM at byte 128, expected a DICOM file"):
+        read_slice(tmp_path / "a.dcm")
+
+
 def test_no_such_file_and_not_dicom(tmp_path):
     with pytest.raises(DicomError, match=r"nowhere.dcm: no such file"):
         read_slice(tmp_path / "nowhere.dcm")

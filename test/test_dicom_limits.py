@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -160,6 +162,56 @@ class TestReceived:
         with pytest.raises(DicomError, match=f"its pixels take {size} bytes, expected {size - 1} at most"):
             received(path, size - 1)
 
+    def test_a_slice_says_where_it_lies(self, tmp_path: Path) -> None:
+        path = write_slice(tmp_path / "a.dcm", IMAGE, ImagePositionPatient=None, ImageOrientationPatient=None)
+        with pytest.raises(DicomError, match=r"Image Position \(Patient\) \(0020,0032\) is missing, expected the pos"):
+            received(path)
+        # A file that somebody chose may do without.
+        assert not read_slice(path).header.has_plane
+
+    def test_every_frame_of_an_enhanced_ct_says_how_its_values_become_hu(self, tmp_path: Path) -> None:
+        path = write_enhanced_ct(tmp_path / "a.dcm", [IMAGE, IMAGE], [5.0, -7.0])
+        dataset = pydicom.dcmread(path)
+        del dataset.PerFrameFunctionalGroupsSequence[1].PixelValueTransformationSequence
+        dataset.save_as(path)
+        with pytest.raises(DicomError, match=r"Rescale Slope \(0028,1053\) is missing, expected that of a CT image"):
+            received(path)
+
+    def test_it_bears_the_uid_that_it_was_announced_with(self, tmp_path: Path) -> None:
+        content = write_slice(tmp_path / "a.dcm", IMAGE, SOPInstanceUID="1.2.3").read_bytes()
+        for announced in ("1.2.3", ""):
+            assert len(read_frames(Path("it"), content, MAX_BYTES, announced)) == 1
+        with pytest.raises(DicomError, match=r"SOP Instance UID .* is '1.2.3', expected 1.2.30, as announced"):
+            read_frames(Path("it"), content, MAX_BYTES, "1.2.30")
+
+    @pytest.mark.parametrize("which", ["SharedFunctionalGroupsSequence", "PlaneOrientationSequence"])
+    def test_of_a_group_that_stands_there_twice_none_is_taken(self, tmp_path: Path, which: str) -> None:
+        path = write_enhanced_ct(tmp_path / "a.dcm", [IMAGE, IMAGE], [5.0, -7.0])
+        dataset = pydicom.dcmread(path)
+        shared = dataset.SharedFunctionalGroupsSequence
+        holder = dataset if which == "SharedFunctionalGroupsSequence" else shared[0]
+        holder[which].value.append(holder[which].value[0])
+        dataset.save_as(path)
+        with pytest.raises(DicomError, match=f"found 2 items in {which}, expected one"):
+            received(path)
+
+    @pytest.mark.parametrize("count", [1, 3])
+    def test_an_enhanced_image_has_a_group_for_each_frame(self, tmp_path: Path, count: int) -> None:
+        frames = [IMAGE, IMAGE + 1, IMAGE + 2][: max(count, 2)]
+        path = write_enhanced_ct(tmp_path / "a.dcm", frames, [5.0, -7.0], NumberOfFrames=count)
+        with pytest.raises(DicomError, match=rf"found 2 items in \(5200,9230\), expected one for each of {count} fram"):
+            received(path)
+
+    def test_what_an_enhanced_image_says_of_itself_outside_its_groups_does_not_count(self, tmp_path: Path) -> None:
+        elements = {"PixelSpacing": [0.9, 0.9], "RescaleSlope": 3.0, "RescaleIntercept": 5.0}
+        path = write_enhanced_ct(tmp_path / "a.dcm", [IMAGE], [5.0], **elements)
+        assert received(path) == [-1024.0]
+        dataset = pydicom.dcmread(path)
+        del dataset.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence
+        dataset.save_as(path)
+        with pytest.raises(DicomError, match=r"Pixel Spacing \(0028,0030\) is missing"):
+            received(path)
+
     def test_a_ct_says_how_its_values_become_hu_and_an_mr_need_not(self, tmp_path: Path) -> None:
         without: dict[str, Any] = {"RescaleSlope": None, "RescaleIntercept": None}
         ct, mr = (
@@ -201,6 +253,17 @@ class TestIntake:
         with pytest.raises(ObjectRefusedError, match=f"has {len(content)} bytes, expected {len(content) - 1} at most"):
             Intake(queue, len(content) - 1).take(Path("it"), content)
         assert len(queue) == 1
+
+    def test_a_slice_has_arrived_when_it_was_there_not_when_it_was_read(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        clock = itertools.count(100.0)
+        monkeypatch.setattr("stereoreg_ros.reception.intake.time", SimpleNamespace(monotonic=lambda: next(clock)))
+        queue = SliceQueue(10)
+        Intake(queue, MAX_BYTES).take(Path("it"), write_slice(tmp_path / "a.dcm", IMAGE).read_bytes())
+        first = queue.first()
+        assert first is not None
+        assert first.arrival_s == 100.0
 
     @pytest.mark.parametrize(
         ("spacing", "is_taken"),

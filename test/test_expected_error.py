@@ -42,6 +42,14 @@ def test_is_the_cramer_rao_bound() -> None:
         np.testing.assert_allclose(found.covariances[0, row], bound, rtol=1e-6, atol=1e-12)
 
 
+def test_slices_are_taken_as_the_registration_assumes() -> None:
+    scale = PixelScale(0.4, 0.7)
+    options = RegistrationOptions(
+        spot_noise_px=0.25, slice_thickness_mm=2.5, frame_tolerance_mm=0.35, scale_tolerance=0.003
+    )
+    assert Imaging.of(scale, options) == Imaging(scale, 0.25, 2.5, 0.35, 0.003)
+
+
 def test_a_rod_left_out() -> None:
     frame, poses = load_frame("cube6"), level(4)
     less = expected(Layouts.of(frame), poses, UPRIGHT, left_out=2)
@@ -185,6 +193,11 @@ class TestMeetings:
             assert (poses.pose(row) @ middle)[2] == pytest.approx(-poses.heights_mm[row])
         assert -12 <= poses.heights_mm.min() < -11
         assert 6 < poses.heights_mm.max() <= 7
+
+    def test_no_direction_of_the_normal_is_met_more_often_than_another(self) -> None:
+        """Of the cap of a sphere, the heights above its rim are all as frequent."""
+        poses = meetings(256, 5, np.zeros(3), np.array([0.0, 0.0]), 60.0)
+        np.testing.assert_allclose(np.sort(poses.rotations[:, 2, 2]), 0.5 + (np.arange(256) + 0.5) / 512, atol=0.004)
 
     def test_any_turn_where_nothing_is_known(self) -> None:
         poses = meetings(400, 5, np.zeros(3), np.array([0.0, 0.0]), 30.0)

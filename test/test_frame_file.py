@@ -125,6 +125,18 @@ def test_what_is_written_is_read_again(
     np.testing.assert_array_equal(again.tolerances_or(np.nan), given_mm)
 
 
+def test_of_a_frame_that_is_written_everything_stands_there(tmp_path: Path) -> None:
+    starts, ends = np.array([[-10.0, -10, -20], [10, -10, -20], [0, 10, -20.125]]), np.full((3, 3), 20.0)
+    diameters, own = np.array([1.0, 1.5, 2.0]), np.array([0.25, np.nan, 0.5])
+    for tolerances in (own, np.full(3, 0.125)):
+        frame = Frame("any", ("a", "b", "c"), starts, ends, diameters, tolerances, True)
+        again = load_frame(written(tmp_path, frame_text(frame, "")))
+        assert again.orientation_required
+        np.testing.assert_array_equal(again.tolerances_or(np.nan), tolerances)
+        np.testing.assert_array_equal(again.diameters, diameters)
+        np.testing.assert_array_equal(again.starts, starts)
+
+
 class TestShipped:
     def test_what_is_shipped(self) -> None:
         assert set(shipped_frames()) == {

@@ -75,6 +75,36 @@ def test_two_of_one_name_that_both_stay_are_a_fault():
     assert "2 nodes called /receiver at once" in sources.fault(1.1 * LEASE_S)
 
 
+def test_three_of_one_name_are_a_fault_once_two_of_them_have_stayed():
+    graph = Graph(("receiver", 1), ("receiver", 2))
+    sources = sources_in(graph)
+    assert sources.fault(0.0) == ""
+    graph.publishers += (("receiver", 3),)
+    assert sources.fault(0.9 * LEASE_S) == ""
+    assert "3 nodes called /receiver at once" in sources.fault(1.1 * LEASE_S)
+
+
+def test_nodes_of_one_name_in_two_namespaces_are_two_names():
+    class Namespaces(Graph):
+        def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
+            first, second = super().get_publishers_info_by_topic(topic)
+            second.node_namespace = "/other"
+            return [first, second]
+
+    fault = sources_in(Namespaces(("scanner", 1), ("scanner", 2))).fault(0.0)
+    assert fault == "/image is published by /other/scanner and /scanner at once, expected one source of slices"
+
+
+def test_every_topic_of_a_slice_is_looked_at():
+    class Topics(Graph):
+        def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
+            return super().get_publishers_info_by_topic(topic)[: 2 if topic == "/slice_pose" else 1]
+
+    node: Any = Topics(("scanner", 1), ("player", 2))
+    inputs: Any = [SimpleNamespace(topic_name=name) for name in ("/image", "/slice_pose", "/slice_spacing")]
+    assert ImageSources(node, inputs).fault(0.0).startswith("/slice_pose is published by /player and /scanner at once")
+
+
 @pytest.mark.parametrize(("topic", "message_type"), [("image", Image), ("slice_pose", PoseStamped)])
 def test_while_two_nodes_publish_nothing_is_registered(topic, message_type):
     hu, slice_from_frame = rendered(8)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pydicom
@@ -19,6 +21,8 @@ from ros_process import RosClient
 from test_receive_dicom_node import CANNOT_UNDERSTAND, OUT_OF_RESOURCES, SUCCESS, port_of, receiver, receiving_process
 
 from stereoreg_ros.dicom import read_slice
+from stereoreg_ros.nodes.receive_dicom_node import ReceiveDicomNode
+from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
 from stereoreg_ros.reception.intake import Intake, ObjectRefusedError
 from stereoreg_ros.reception.kept_objects import KeptObjects, is_uid
 from stereoreg_ros.reception.slice_queue import SliceQueue
@@ -157,6 +161,15 @@ def test_what_a_crash_left_is_removed_at_the_start(folder):
     (folder / "1.2.4.dcm").write_bytes(b"whole")
     KeptObjects(folder).remove_unfinished()
     assert [one.name for one in folder.iterdir()] == ["1.2.4.dcm"]
+
+
+def test_the_receiver_removes_it_before_it_listens(folder):
+    (folder / ".1.2.3.dcm.00ff00ff.part").write_bytes(b"half")
+    settings = ReceptionSettings(port=0, keep_folder=str(folder))
+    node: Any = SimpleNamespace()
+    service = ReceiveDicomNode._listen(node, settings, Intake(SliceQueue(1), 2**20))
+    service._server.server_close()
+    assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize(

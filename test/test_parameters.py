@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
+from rclpy.parameter import Parameter
 
 from stereoreg_ros.nodes import reception_parameters
-from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings
+from stereoreg_ros.nodes.parameters import ENTRIES, NodeSettings, ParameterError, changed_settings, declare_settings
 from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
 from stereoreg_ros.options import MATCHERS, CalibrationOptions, RegistrationOptions
+from stereoreg_ros.reception.bounded_socket import Limits
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 DEFAULTS = {entry.name: entry.default for entry in ENTRIES}
@@ -89,8 +92,9 @@ def test_values_reach_their_places():
         threshold=1500.0, frame_tolerance_mm=0.4, scale_tolerance=0.01, max_target_error_mm=5.0
     )
     changed = {**DEFAULTS, **asdict(options), "pixel_spacing": (0.5, 0.7), "pixel_shear": 0.01}
-    settings = NodeSettings.from_parameters(changed)
-    assert settings.options == options
+    calibration = CalibrationOptions(calibration_slices=7, calibrate_shear=True, calibration_max_change=0.1)
+    settings = NodeSettings.from_parameters(changed | asdict(calibration))
+    assert (settings.options, settings.calibration) == (options, calibration)
     assert settings.scale is not None
     assert (settings.scale.sx, settings.scale.sy, settings.scale.shear) == (0.5, 0.7, 0.01)
 
@@ -123,6 +127,54 @@ def test_faulty_value_is_named(name, value, sentence):
         NodeSettings.from_parameters({**DEFAULTS, name: value})
 
 
+def test_of_several_frames_every_one_is_a_source_and_frame_file_is_none():
+    several = NodeSettings.from_parameters({**DEFAULTS, "frame_file": "cube5", "frame_files": ("cube6", "cube8")})
+    assert several.frame_sources == ("cube6", "cube8")
+    # An empty list in a parameter file comes as nothing at all.
+    for none in ((), None):
+        one = NodeSettings.from_parameters({**DEFAULTS, "frame_file": "cube5", "frame_files": none})
+        assert (one.frame_sources, one.frame_files) == (("cube5",), ())
+
+
+@pytest.mark.parametrize("names", [("cube6", ""), ("cube6", 7), "cube6"])
+def test_frames_that_have_no_names_are_named(names):
+    with pytest.raises(ValueError, match=r"frame_files is .*, expected a list of names or paths"):
+        NodeSettings.from_parameters({**DEFAULTS, "frame_files": names})
+
+
+class Told:
+    """Stands in for a node that was started with these parameters, beside the defaults."""
+
+    def __init__(self, **told):
+        self.told, self.held = told, {}
+
+    def declare_parameter(self, name, default, _descriptor):
+        self.held[name] = Parameter(name, value=self.told.get(name, default))
+        return self.held[name]
+
+    def get_parameter(self, name):
+        return self.held[name]
+
+
+def told(**parameters: Any) -> Any:
+    """A node for whoever asks for one."""
+    return Told(**parameters)
+
+
+def test_a_node_is_as_it_was_told_at_its_start_and_as_it_is_changed():
+    node = told(frame_file="cube5", pixel_spacing=[0.5, 0.7], frame_files=["cube6", "cube8"], calibration_slices=7)
+    settings = declare_settings(node)
+    assert (settings.frame_file, settings.frame_files) == ("cube5", ("cube6", "cube8"))
+    assert (settings.pixel_spacing, settings.calibration.calibration_slices) == ((0.5, 0.7), 7)
+    changes = [Parameter("pixel_spacing", value=[0.4, 0.3]), Parameter("use_sim_time", value=True)]
+    changed = changed_settings(node, changes)
+    assert changed == replace(settings, pixel_spacing=(0.4, 0.3))
+    with pytest.raises(ValueError, match="calibration_slices is not set, expected a value"):
+        changed_settings(node, [*changes, Parameter("calibration_slices", Parameter.Type.NOT_SET)])
+    with pytest.raises(ParameterError, match="pixel_spacing has 1 numbers, expected two"):
+        declare_settings(told(pixel_spacing=[0.5]))
+
+
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
@@ -149,6 +201,27 @@ def test_faulty_value_of_the_receiver_is_named(values, sentence):
 
 def test_the_receiver_tells_clients_their_limits_in_bytes():
     assert ReceptionSettings(max_object_mb=3, allowed_callers=("CT1", "CT2")).limits.max_object_bytes == 3 * 2**20
+
+
+def test_each_limit_of_the_receiver_has_its_place():
+    told = ReceptionSettings(max_object_mb=1, max_associations=2, association_timeout=3.0, network_timeout=4.0)
+    assert told.limits == Limits(2**20, max_associations=2, association_timeout_s=3.0, network_timeout_s=4.0)
+
+
+def test_a_title_of_the_receiver_may_have_sixteen_characters():
+    assert ReceptionSettings(ae_title="A TITLE SO LONG.").ae_title == "A TITLE SO LONG."
+
+
+def test_no_object_is_kept_where_it_would_be_found_again_not_even_behind_a_link(tmp_path):
+    for name in ("watched", "watched/below", "beside"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "watched" / "below")
+    watched = str(tmp_path / "watched")
+    for name in ("watched", "watched/below", "link"):
+        with pytest.raises(ValueError, match="every slice would come twice"):
+            ReceptionSettings(watch_folder=watched, keep_folder=str(tmp_path / name))
+    for name in ("beside", "."):
+        assert ReceptionSettings(watch_folder=watched, keep_folder=str(tmp_path / name)).keep_folder
 
 
 @pytest.mark.parametrize("matcher", MATCHERS)

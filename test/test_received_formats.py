@@ -8,7 +8,15 @@ import pytest
 from compressed_files import SYNTAXES, Syntax, convert
 from dicom_clients import send
 from dicom_files import write_enhanced_ct, write_slice
-from pydicom.uid import JPEG2000Lossless, MRImageStorage, RLELossless
+from pydicom.uid import (
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    JPEG2000Lossless,
+    MRImageStorage,
+    RLELossless,
+)
 
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
@@ -16,6 +24,7 @@ from ros_process import RosClient
 from test_play_dicom_node import pixels
 from test_receive_dicom_node import CANNOT_UNDERSTAND, SUCCESS, receiver
 
+from stereoreg_ros.reception import transfer_syntaxes
 from stereoreg_ros.reception.transfer_syntaxes import readable
 
 # Smooth with an edge and a little noise, as a slice is: 12 bits, and not so flat that a codec has nothing to do.
@@ -48,6 +57,17 @@ def test_every_transfer_syntax(tmp_path, received, syntax, signed):
     assert send(received.port, path)[0].Status == SUCCESS
     off = np.abs(last_image(received, before + 1) - (stored.astype(int) - 1024))
     assert off.max() <= syntax.loss
+
+
+def test_without_decoders_only_what_is_not_compressed_is_announced(monkeypatch):
+    monkeypatch.setattr(transfer_syntaxes, "_has_decoder", lambda syntax: syntax == RLELossless)
+    assert set(readable()) == {
+        ExplicitVRLittleEndian,
+        ImplicitVRLittleEndian,
+        DeflatedExplicitVRLittleEndian,
+        ExplicitVRBigEndian,
+        RLELossless,
+    }
 
 
 def test_mr(tmp_path, received):

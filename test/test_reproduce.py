@@ -22,15 +22,18 @@ from stereoreg_ros.reproduction.poses_and_noise import (
     SCALE,
     all_lines,
     bound_of_frame_from_slice,
+    level_seed,
     mean_length,
     position_error,
     random_problem,
     reprojection_error,
     rotation_error,
+    uniform_std,
 )
-from stereoreg_ros.reproduction.predicted_rods import predict
+from stereoreg_ros.reproduction.predicted_rods import Prediction, predict
 from stereoreg_ros.reproduction.rods import EIGHT_RODS, FIRST_CUBE, SECOND_CUBE, first_rods, shrunk
 from stereoreg_ros.reproduction.table import Comparison, Table, markdown_table
+from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, random_spot_set
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError, three_coplanar_lines
 from stereoreg_ros.solvers.maximum_likelihood import solve_maximum_likelihood
 from stereoreg_ros.solvers.pose_solution import PoseSolution
@@ -245,6 +248,16 @@ def test_a_level_is_the_same_whichever_others_are_measured():
     assert (one.mean["N-R"][0] == two.mean["N-R"][1]).all()
 
 
+def test_every_level_has_poses_and_noise_of_its_own():
+    seeds = [tuple(level_seed(0, 8, 4, amplitude)) for amplitude in FULL.levels_px]
+    assert len(set(seeds)) == len(FULL.levels_px)
+
+
+def test_the_deviation_of_uniform_noise():
+    drawn = np.random.default_rng(0).uniform(-0.5, 0.5, 100_000)
+    assert uniform_std(0.5) == pytest.approx(drawn.std(), rel=0.01)
+
+
 def test_problems_are_those_of_section_6():
     rng = np.random.default_rng(0)
     reach = np.zeros(3)
@@ -286,7 +299,10 @@ def test_frames_are_sound():
             for other in range(one):
                 gaps = points[:, None, one] - points[None, :, other]
                 assert np.linalg.norm(gaps, axis=-1).min() > 4
-    assert first_rods(EIGHT_RODS, 5).line_names == tuple("abcde")
+    five = first_rods(EIGHT_RODS, 5)
+    assert five.line_names == tuple("abcde")
+    assert (five.starts == EIGHT_RODS.starts[:5]).all()
+    assert (five.ends == EIGHT_RODS.ends[:5]).all()
     small = shrunk(FIRST_CUBE, 0.5)
     assert (small.ends == 0.5 * FIRST_CUBE.ends).all()
     assert (small.diameters == FIRST_CUBE.diameters).all()
@@ -376,6 +392,38 @@ def test_the_box_of_a_predicted_rod_is_reached_and_not_left():
         reached = np.maximum(reached, np.abs(moved_px - predicted_px) / (0.01 * half_px))
     assert reached.max() < 1.01
     assert reached.min() > 0.6
+
+
+def test_a_spot_lies_in_its_box_only_along_both_sides():
+    off = np.array([[0.4, 0.6], [0.6, 0.6], [0.4, 0.8], [-0.5, 0.7], [0.0, -0.9]])
+    half = np.tile([0.5, 0.7], (5, 1))
+    made = Prediction("rail", 1, "cube", tuple("abcde"), np.full((5, 2), 9.0), 9.0 + off, half)
+    assert made.inside.tolist() == [True, False, False, True, False]
+    np.testing.assert_allclose(made.half_mm, half * 0.475)
+
+
+def test_two_cubes_are_as_good_as_the_papers_where_no_mean_error_is_larger_either_way():
+    """The paper's mean errors have no sign."""
+    rail = two_cubes.RAILS[1]
+    theirs = paper.RAIL[5, "LS"]
+    for sign, share, holds in ((1.0, 0.9, True), (-1.0, 0.9, True), (1.0, 1.1, False), (-1.0, 1.1, False)):
+        mean, std = sign * share * np.array(theirs.mean), 0.9 * np.array(theirs.std)
+        offsets = two_cubes.RailOffsets(rail, 9, np.arange(9), {})
+        assert two_cubes._compare(offsets, "LS-SVD", mean, std, 9).holds is holds
+    offsets = two_cubes.RailOffsets(rail, 9, np.arange(9), {})
+    assert not two_cubes._compare(offsets, "LS-SVD", 0.0 * mean, 1.1 * np.array(theirs.std), 9).holds
+
+
+def test_a_matching_is_right_where_every_rod_is_on_its_true_spot():
+    settings = SpotSetSettings(ScannerSettings(), 6, 4, paper.NOISE_PX)
+    problem = random_spot_set(np.random.default_rng(1), FIRST_CUBE, settings)
+    exact = project(FIRST_CUBE, problem.slice_from_frame, ScannerSettings().scale)[0]
+    own = np.linalg.norm(problem.spots_px[:, None] - exact, axis=-1).argmin(axis=0)
+    pairs = [(line, int(spot)) for line, spot in enumerate(own)]
+    assert matching_time._all_right(pairs, problem)
+    assert matching_time._all_right(pairs[:4], problem)
+    others = [spot for spot in range(10) if spot not in own]
+    assert not matching_time._all_right([*pairs[:5], (5, others[0])], problem)
 
 
 def test_table_and_markdown(tmp_path):

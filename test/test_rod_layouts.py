@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -84,3 +86,14 @@ def test_cut_many_layouts_at_once() -> None:
 def test_wrong_envelopes(size, gap, what) -> None:
     with pytest.raises(ValueError, match=what):
         Envelope(size, gap)
+
+
+def test_a_frame_as_a_layout_and_back_keeps_its_tolerances() -> None:
+    frame = load_frame("cube6")
+    own = np.array([0.1, 0.2, 0.3, np.nan, 0.5, 0.0])
+    layouts = Layouts.of(replace(frame, tolerances_mm=own))
+    np.testing.assert_array_equal(layouts.tolerances_or(9.0), [0.1, 0.2, 0.3, 9.0, 0.5, 0.0])
+    again = layouts.frame(0, "again")
+    np.testing.assert_array_equal(again.tolerances_or(9.0), [0.1, 0.2, 0.3, 9.0, 0.5, 0.0])
+    np.testing.assert_array_equal(again.starts, frame.starts)
+    np.testing.assert_array_equal(again.ends, frame.ends)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -14,8 +15,10 @@ from ros_process import NodeProcess, RosClient, node_process
 from sensor_msgs.msg import Image
 
 from stereoreg_ros.geometry.frame_file import load_frame
+from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.conversions import hu_from_image, pose_from_message
 from stereoreg_ros.nodes.simulate_node import Passage, SimulationSettings
+from stereoreg_ros.simulation import PlacedFrame, ScannerSettings
 
 
 def arguments(**parameters: object) -> list[str]:
@@ -89,6 +92,69 @@ def test_a_bad_parameter_ends_it_with_a_sentence() -> None:
 def test_bad_settings_are_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"^{name} (is|has) .*, expected "):
         SimulationSettings(**{name: value})
+
+
+def test_settings_reach_the_scanner() -> None:
+    settings = SimulationSettings(
+        rows=300,
+        columns=200,
+        pixel_spacing=(0.4, 0.7),
+        slice_thickness_mm=2.5,
+        noise_hu=7.0,
+        false_spots=4,
+        needle=True,
+        body=False,
+    )
+    wanted = ScannerSettings(
+        (300, 200), PixelScale(0.4, 0.7), 2.5, noise_hu=7.0, false_spots=4, needle=True, body=False
+    )
+    assert settings.scanner == wanted
+    other = replace(settings, needle=False, body=True).scanner
+    assert (other.needle, other.body) == (False, True)
+
+
+class Rendered:
+    """What each slice of a passage was made of."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, settings: SimulationSettings, room: bool = True) -> None:
+        self.hidden: list[tuple[str, ...]] = []
+        self.scanners: list[ScannerSettings] = []
+        self._room = room
+        monkeypatch.setattr("stereoreg_ros.nodes.simulate_node.render_slice", self._render)
+        simulation = Passage(load_frame("cube6"), settings)
+        self.poses = [simulation.next_slice()[1] for _ in range(300)]
+
+    def _render(self, placed: list[PlacedFrame], scanner: ScannerSettings, _rng: object) -> None:
+        if scanner.false_spots and not self._room:
+            raise ValueError("no room")
+        self.hidden.append(placed[0].hidden_lines)
+        self.scanners.append(scanner)
+
+
+def test_as_often_as_asked_for_one_rod_is_missing_and_up_to_so_many_false_spots_are_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = Rendered(monkeypatch, SimulationSettings(missing_probability=0.2, false_spots=3))
+    assert {len(one) for one in made.hidden} == {0, 1}
+    assert sum(map(len, made.hidden)) / 300 == pytest.approx(0.2, abs=0.07)
+    assert {name for one in made.hidden for name in one} == set("abcdef")
+    assert {scanner.false_spots for scanner in made.scanners} == {0, 1, 2, 3}
+    assert not any(Rendered(monkeypatch, SimulationSettings(missing_probability=0.0)).hidden)
+
+
+def test_without_room_for_clutter_the_missing_rod_is_missing_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Rendered(monkeypatch, SimulationSettings(missing_probability=1.0, false_spots=30), room=False)
+    assert {len(one) for one in made.hidden} == {1}
+    assert not any(scanner.false_spots for scanner in made.scanners)
+
+
+def test_the_frame_moves_by_the_step_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Rendered(monkeypatch, SimulationSettings(step_mm=0.25))
+    frame = load_frame("cube6")
+    ends = np.concatenate([frame.starts, frame.ends])
+    middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
+    heights = [(pose @ middle)[2] for pose in made.poses[:40]]
+    np.testing.assert_allclose(np.abs(np.diff(heights)), 0.25, atol=1e-9)
 
 
 def test_image_too_small_for_the_frame() -> None:

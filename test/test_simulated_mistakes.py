@@ -289,6 +289,13 @@ def test_fragments() -> None:
     assert np.bincount(alone.rods).tolist() == [2] * 6
 
 
+def test_fragments_fill_the_disc_evenly() -> None:
+    drawn = scenes(partial(fragments, pieces=(6, 6), radius_mm=(20.0, 20.0)), "cube8", count=10)
+    shares = np.concatenate([off_truth_px(scene) for scene in drawn]) * 0.5 / 20.0
+    # Of the disc's area, as many lie within each share of it.
+    np.testing.assert_allclose(np.quantile(shares**2, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.08)
+
+
 def test_collinear() -> None:
     for scene in scenes(collinear, "cube6"):
         assert scene.truth is not None

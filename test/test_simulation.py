@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -23,6 +24,7 @@ from stereoreg_ros.simulation import (
     random_pose,
     render_slice,
 )
+from stereoreg_ros.simulation.scene import _clear_of, _outline
 
 BARE = ScannerSettings(noise_hu=0, body=False, block=False)
 CUBE = Frame(
@@ -134,6 +136,12 @@ class TestSpot:
         # What brute force itself is good for on so coarse a grid.
         np.testing.assert_allclose(image, expected, atol=0.006)
 
+    def test_a_rod_shows_the_same_from_either_end(self) -> None:
+        rod = leaning(30, 20, np.array([20.0, 24.0]))
+        scale = PixelScale(0.5, 0.4)
+        down = rendered(Cylinder(rod.end, rod.start, rod.diameter), scale, 1.5)
+        np.testing.assert_allclose(down, rendered(rod, scale, 1.5), atol=1e-4)
+
     def test_a_rod_that_ends_in_the_slice_is_fainter(self) -> None:
         scale = PixelScale(0.5, 0.5)
         whole = rendered(Cylinder(np.array([20.0, 20, -9]), np.array([20.0, 20, 9]), 1.0), scale, 2.0)
@@ -205,6 +213,16 @@ class TestSlice:
             alone = render_slice(placed, BARE, rng).hu
             assert np.array_equal(hu[near], alone[near])
 
+    def test_clutter_is_clear_of_everything_that_is_there(self) -> None:
+        """Of places that are clear of nothing, of one of two, and of both by 3.9 and by 4.1 mm, the last is taken."""
+        there = [leaning(0, 0, np.array([x, 50.0])) for x in (50.0, 90.0)]
+        occupied = [_outline(one, BARE) for one in there]
+        places = [50.5, 89.0, 54.9, 55.1]
+        drawn = iter([leaning(0, 0, np.array([x, 50.0])) for x in places])
+        found = _clear_of(occupied, BARE, lambda: next(drawn), "something")
+        assert found.start[0] == 55.1
+        assert len(occupied) == 3
+
     def test_needle_is_long_bright_and_clear_of_the_rods(self) -> None:
         settings = ScannerSettings(noise_hu=0, body=False, block=False, needle=True)
         for seed in range(3):
@@ -272,6 +290,14 @@ class TestMotion:
             pose = random_pose(rng, CUBE, BARE, nominal=nominal, max_tilt_deg=5, max_offset_mm=2, max_depth_mm=1)
             assert np.degrees(rotation_angle(pose.rotation @ nominal.rotation.T)) < 9
             assert (np.abs(pose.translation - nominal.translation) <= [2, 2, 1]).all()
+
+    def test_the_middle_of_the_frame_is_where_it_is_asked_for_wherever_its_origin_is(self) -> None:
+        shift = np.array([5.0, 80.0, -40.0])
+        shifted = replace(CUBE, starts=CUBE.starts + shift, ends=CUBE.ends + shift)
+        rng = np.random.default_rng(6)
+        for _ in range(20):
+            pose = random_pose(rng, shifted, BARE, max_offset_mm=2, max_depth_mm=1)
+            assert (np.abs(pose @ shift - [128.0, 128.0, 0.0]) <= [2, 2, 1]).all()
 
     def test_random_pose_that_cannot_be(self) -> None:
         rng = np.random.default_rng(3)
