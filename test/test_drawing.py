@@ -72,6 +72,21 @@ class TestColours:
         assert count(picture, BLUE, missing, self.ZOOM) > 30
         assert count(picture, GREEN, missing, self.ZOOM) == 0
 
+    def test_a_residual_is_drawn_from_the_prediction_to_the_side_of_the_spot_ten_times_as_long(self) -> None:
+        result = accepted()
+        picture = draw_overlay(a_slice(), result)
+
+        def is_red(pixel: Array) -> bool:
+            u, v = np.round(pixel * self.ZOOM + (self.ZOOM - 1) / 2).astype(int)
+            near = picture[v + HEADER - 1 : v + HEADER + 2, u - 1 : u + 2].astype(int)
+            return bool((np.abs(near - RED).max(axis=-1) <= 40).any())
+
+        for match in result.matches:
+            residual_px = match.spot_px - match.predicted_px
+            assert is_red(match.predicted_px + 9.5 * residual_px)
+            assert not is_red(match.predicted_px + 11.5 * residual_px)
+            assert not is_red(match.predicted_px - 4 * residual_px)
+
     def test_a_rod_that_the_slice_does_not_meet_is_not_missed(self) -> None:
         # So far along that rods end before the slice: none of them is inside.
         estimate, spots = an_estimate()
