@@ -102,9 +102,10 @@ demo: venv
 	@mkdir -p '$(dir $(DEMO_OUTPUT))'
 	$(WITH_ROS) $(EXECUTABLES)/demo_report --slices $(SLICES) --output '$(DEMO_OUTPUT)'
 
-# Two processes on two cores: threads of OpenBLAS would only get in each other's way.
+# Two processes on two cores: threads of OpenBLAS would only get in each other's way. Not the files of few tests last, as
+# xdist would have it: these few are the longest.
 test: venv catphan debian
-	$(WITH_ROS) OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile)
+	$(WITH_ROS) OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile --no-loadscope-reorder)
 
 # colcon test is content where no test ran.
 colcon-test: venv

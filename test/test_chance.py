@@ -12,10 +12,10 @@ from benchmarks.clutter import THRESHOLDS, Clutter, count
 @pytest.mark.parametrize(
     ("clutter", "sets"),
     [
-        (Clutter("cube6", 10, 14, 90.0, 0.3, 0.0), 60),
-        (Clutter("zframe", 8, 12, 120.0, 0.3, 0.0), 60),
-        (Clutter("leksell_ct", 8, 12, 256.0, 0.3, 0.0), 60),
-        (Clutter("cube6", 8, 12, 256.0, 0.3, 0.0, tolerance_mm=0.5, scale_tolerance=0.005), 60),
+        (Clutter("cube6", 10, 14, 90.0, 0.3, 0.0), 30),
+        (Clutter("zframe", 8, 12, 120.0, 0.3, 0.0), 30),
+        (Clutter("leksell_ct", 8, 12, 256.0, 0.3, 0.0), 30),
+        (Clutter("cube6", 8, 12, 256.0, 0.3, 0.0, tolerance_mm=0.5, scale_tolerance=0.005), 30),
     ],
     ids=lambda value: f"{value.frame}, {value.tolerance_mm} mm" if isinstance(value, Clutter) else "",
 )
@@ -37,6 +37,6 @@ def test_crowded_clutter_brings_some() -> None:
 
 @pytest.mark.parametrize("name", ["cube6", "leksell_ct", "zframe"])
 def test_none_is_accepted_at_the_default(name: str) -> None:
-    result = count(Clutter(name, 5, 60, 256.0, 0.3, -6.0), 100, seed=6)
+    result = count(Clutter(name, 5, 60, 256.0, 0.3, -6.0), 40, seed=6)
     assert result.accepted == 0
     assert set(result.reasons) <= {"no_consensus", "too_few_spots"}

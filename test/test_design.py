@@ -238,7 +238,7 @@ class TestCommands:
 
     @pytest.mark.usefixtures("quick")
     def test_design(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-        told = ["--name", "mine", "--lines", "6", "--chains", "1", "--poses", "12"]
+        told = ["--name", "mine", "--lines", "6", "--chains", "1", "--poses", "4"]
         told += ["--frame-tolerance-mm", "0", "--scale-tolerance", "0", "--max-target-error-mm", "1000"]
         assert main(["design", *told, "--output", str(tmp_path)]) == 0
         assert "mine: 6 rods" in capsys.readouterr().out
