@@ -102,10 +102,11 @@ demo: venv
 	@mkdir -p '$(dir $(DEMO_OUTPUT))'
 	$(WITH_ROS) $(EXECUTABLES)/demo_report --slices $(SLICES) --output '$(DEMO_OUTPUT)'
 
-# Two processes on two cores: threads of OpenBLAS would only get in each other's way. Not the files of few tests last, as
-# xdist would have it: these few are the longest.
+# Two processes on two cores: threads of OpenBLAS would only get in each other's way. By default xdist runs the files with
+# the fewest tests last, and here those tests take the longest.
+TEST_ALL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 test: venv catphan debian
-	$(WITH_ROS) OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest $(or $(PYTEST_ARGS),--numprocesses 2 --dist loadfile --no-loadscope-reorder)
+	$(WITH_ROS) OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest $(or $(PYTEST_ARGS),$(TEST_ALL))
 
 # colcon test is content where no test ran.
 colcon-test: venv

@@ -85,8 +85,8 @@ def test_an_accepted_pose_that_exchanges_two_rods_is_wrong_and_a_twin_with_what_
     registering.pose = Pose(turn @ TRUTH.rotation, TRUTH.translation + np.array([3.0, 4.0, 0.0]))
     (trial,) = tried(out=3)
     assert (trial.left_out, trial.reason, trial.right) == (3, "", False)
-    ((told, angle_deg, distance_mm),) = trial.twins
-    assert told == "a,b,c,e,f -> b,a,c,e,f"
+    ((exchange, angle_deg, distance_mm),) = trial.twins
+    assert exchange == "a,b,c,e,f -> b,a,c,e,f"
     assert (angle_deg, distance_mm) == pytest.approx((10.0, 5.0))
 
 
@@ -96,7 +96,7 @@ def test_of_a_refused_slice_the_best_explanation_counts_and_every_other_is_a_twi
     Registering(monkeypatch, range(6), [1, 2, 3, 4, 5, 0], refused="ambiguous")
     (trial,) = tried()
     assert (trial.reason, trial.right) == ("ambiguous", True)
-    assert [told for told, *_ in trial.twins] == ["a,b,c,d,e,f -> b,c,d,e,f,a"]
+    assert [exchange for exchange, *_ in trial.twins] == ["a,b,c,d,e,f -> b,c,d,e,f,a"]
     Registering(monkeypatch, [1, 2, 3, 4, 5, 0], range(6), refused="ambiguous")
     assert not tried()[0].right
     Registering(monkeypatch, refused="no_consensus")

@@ -15,7 +15,7 @@ ASSOCIATION_S, NETWORK_S = 5.0, 30.0
 
 
 class Client:
-    """A client that sends so many bytes at a time, each time after so many seconds; and the clock."""
+    """A client that sends up to `part` bytes at a time, after a pause of `pause_s` before each; and the clock."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, part: int, pause_s: float, established: bool) -> None:
         self.now_s, self._part, self._pause_s = 0.0, part, pause_s
@@ -46,7 +46,7 @@ class Client:
 
 
 @pytest.mark.parametrize(("established", "limit_s"), [(False, ASSOCIATION_S), (True, NETWORK_S)])
-def test_a_pdu_has_so_much_time_however_often_some_of_it_comes(
+def test_a_pdu_must_be_complete_in_time_however_often_a_part_of_it_arrives(
     monkeypatch: pytest.MonkeyPatch, established: bool, limit_s: float
 ) -> None:
     client = Client(monkeypatch, 1, 1.0, established)

@@ -294,13 +294,11 @@ def flags_of(options: RegistrationOptions) -> list[str]:
     return flags
 
 
-def test_inspect_passes_on_all_that_it_is_told(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_passes_on_all_its_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     given: list[tuple[Any, ...]] = []
 
-    def inspect_frame(*told: Any) -> None:
-        given.append(told[:-1])
+    def inspect_frame(*arguments: Any) -> None:
+        given.append(arguments[:-1])
         raise ValueError("seen enough")
 
     monkeypatch.setattr("stereoreg_ros.cli.inspect.inspect_frame", inspect_frame)
@@ -315,7 +313,7 @@ def test_inspect_passes_on_all_that_it_is_told(
 class TestDesign:
     """With a proposal that was made by hand in place of a search."""
 
-    TOLD = (
+    FLAGS = (
         *("--name", "mine", "--lines", "5", "--envelope", "30", "40", "80", "--diameter", "0.5", "--gap", "2.5"),
         *("--pixel-spacing", "0.4", "0.7", "--tilt", "12", "--seed", "3", "--chains", "7"),
         *flags_of(OPTIONS),
@@ -336,29 +334,29 @@ class TestDesign:
         monkeypatch.setattr("stereoreg_ros.cli.design.draw", lambda *_: None)
         return cli.main(["design", *flags, "--output", str(folder)])
 
-    def test_all_that_it_is_told_is_passed_on(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        assert self.call(monkeypatch, tmp_path, *self.TOLD) == 0
+    def test_all_options_are_passed_on(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        assert self.call(monkeypatch, tmp_path, *self.FLAGS) == 0
         wish, *others = self.asked
         assert isinstance(wish, Wish)
         assert (wish.envelope.size_mm, wish.envelope.gap_mm) == ((30.0, 40.0, 80.0), 2.5)
         assert wish.diameters_mm == (0.5,) * 5
         assert wish.imaging == Imaging.of(PixelScale(0.4, 0.7), OPTIONS)
         assert wish.target_mm == (1.0, -2.0, 3.0)
-        # A quarter of the box's height, where nothing is told.
+        # By default a quarter of the box's height.
         assert (wish.largest_tilt_deg, wish.largest_height_mm) == (12.0, 20.0)
         assert others == ["mine", OPTIONS, 3, 7]
 
     @pytest.mark.parametrize("height", [0.0, 7.5])
-    def test_a_height_may_be_told_even_none_at_all(
+    def test_a_height_can_be_given_even_zero(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, height: float
     ) -> None:
-        assert self.call(monkeypatch, tmp_path, *self.TOLD, "--height", str(height)) == 0
+        assert self.call(monkeypatch, tmp_path, *self.FLAGS, "--height", str(height)) == 0
         assert self.asked[0].largest_height_mm == height
 
     def test_the_call_that_stands_in_the_file_asks_for_the_same(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
-        assert self.call(monkeypatch, tmp_path, *self.TOLD, "--height", "0") == 0
+        assert self.call(monkeypatch, tmp_path, *self.FLAGS, "--height", "0") == 0
         wish, *others = self.asked
         lines = [line[2:] for line in (tmp_path / "mine.yaml").read_text().splitlines() if line.startswith("# ")]
         assert lines[0].startswith("6 rods; 95 % target error 0.250 mm over the slices")
@@ -375,14 +373,14 @@ class TestDesign:
     def test_an_ambiguous_frame_is_written_and_complained_of(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        assert self.call(monkeypatch, tmp_path, *self.TOLD, ambiguous=1) == 1
+        assert self.call(monkeypatch, tmp_path, *self.FLAGS, ambiguous=1) == 1
         assert {path.name for path in tmp_path.iterdir()} == {"mine.yaml", "mine.txt"}
         assert "another pose explains 1 of 20 spot sets as well" in capsys.readouterr().err
 
     def test_an_interrupted_search_leaves_its_best_and_no_report(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        assert self.call(monkeypatch, tmp_path, *self.TOLD, interrupted=True) == 130
+        assert self.call(monkeypatch, tmp_path, *self.FLAGS, interrupted=True) == 130
         assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
         assert "mine.yaml is the best layout so far, not tried for ambiguous poses" in capsys.readouterr().err
 

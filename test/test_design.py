@@ -229,18 +229,18 @@ class TestInspection:
 class TestCommands:
     def test_inspect(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         picture = tmp_path / "cube6.png"
-        told = ["--frame", "cube6", "--poses", "12", "--target-in-frame-mm", "0", "100", "0"]
-        assert main(["inspect", *told, "--picture", str(picture)]) == 0
+        arguments = ["--frame", "cube6", "--poses", "12", "--target-in-frame-mm", "0", "100", "0"]
+        assert main(["inspect", *arguments, "--picture", str(picture)]) == 0
         assert "at the target (0, 100, 0)" in capsys.readouterr().out
         assert picture.read_bytes().startswith(b"\x89PNG")
-        assert main(["inspect", *told, "--json"]) == 0
+        assert main(["inspect", *arguments, "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["target_in_frame_mm"] == [0.0, 100.0, 0.0]
 
     @pytest.mark.usefixtures("quick")
     def test_design(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-        told = ["--name", "mine", "--lines", "6", "--chains", "1", "--poses", "4"]
-        told += ["--frame-tolerance-mm", "0", "--scale-tolerance", "0", "--max-target-error-mm", "1000"]
-        assert main(["design", *told, "--output", str(tmp_path)]) == 0
+        arguments = ["--name", "mine", "--lines", "6", "--chains", "1", "--poses", "4"]
+        arguments += ["--frame-tolerance-mm", "0", "--scale-tolerance", "0", "--max-target-error-mm", "1000"]
+        assert main(["design", *arguments, "--output", str(tmp_path)]) == 0
         assert "mine: 6 rods" in capsys.readouterr().out
         frame = load_frame(tmp_path / "mine.yaml")
         assert len(frame) == 6

@@ -62,7 +62,7 @@ def test_an_image_that_never_came_to_registration_has_the_same_keys_and_nothing_
     assert list(values) == [
         entry.key for entry in status_of(Refusal(FRAME, SCALE, SPOTS, "bad_image", ""), "", 0.0, "ct").values
     ]
-    told = {
+    known = {
         "outcome": "refused",
         "reason": "bad_image",
         "frame": "cube6",
@@ -76,4 +76,4 @@ def test_an_image_that_never_came_to_registration_has_the_same_keys_and_nothing_
         "duration_ms": "12.5",
     }
     # What was not found is no number, least of all a good one.
-    assert values == dict.fromkeys(DIAGNOSTIC_KEYS, "nan") | told
+    assert values == dict.fromkeys(DIAGNOSTIC_KEYS, "nan") | known

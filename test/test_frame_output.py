@@ -65,8 +65,8 @@ def test_pose_covariance_and_transform_are_of_one_slice_in_the_scanner() -> None
     assert (position.x, position.y, position.z) == pytest.approx((0.00125, -0.0205, 0.3))
     assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
     units = np.array([1e-3] * 3 + [1.0] * 3)
-    told = np.reshape(with_covariance.pose.covariance, (6, 6))
-    np.testing.assert_allclose(told, COVARIANCE * units * units[:, None], atol=1e-15)
+    published = np.reshape(with_covariance.pose.covariance, (6, 6))
+    np.testing.assert_allclose(published, COVARIANCE * units * units[:, None], atol=1e-15)
     assert made.transforms[0].child_frame_id == "cube"
     latest = made.output.latest
     assert latest is not None

@@ -91,7 +91,7 @@ class TestFigures:
         assert found.visible.sum(axis=1).min() == fewest
         assert found.record()["share_of_poses_shown"] == found.shown < 1.0
 
-    def test_slices_are_those_of_a_frame_that_stands_as_it_is_told(self) -> None:
+    def test_slices_are_those_of_a_frame_that_stands_as_configured(self) -> None:
         """Head down, and within twenty degrees of that."""
         options = replace(NOISE_ALONE, nominal_orientation=(1.0, 0.0, 0.0, 0.0), max_rotation_deg=20.0)
         found = inspected(options=options, count=50)
@@ -112,16 +112,16 @@ class TestTrials:
     ) -> None:
         made[2] = Trial(2, "ambiguous", False, (("a -> b", 90.0, 3.0), ("b -> a", 80.0, 2.0)))
         made[3] = Trial(3, "", False, (("a -> b", 70.0, 5.0),))
-        told: list[float] = []
+        shares: list[float] = []
 
         def progress(share: float) -> bool:
-            told.append(share)
+            shares.append(share)
             return True
 
         found = inspected(count=12, progress=progress)
         assert [trial.left_out for trial in found.whole] == [None] * 12
         assert [trial.left_out for trial in found.one_missing] == [0, 1, 2, 3, 4, 5] * 2
-        np.testing.assert_allclose(told, np.arange(1, 25) / 24)
+        np.testing.assert_allclose(shares, np.arange(1, 25) / 24)
         record = found.record()
         assert (record["outcomes"], record["outcomes_one_rod_missing"]) == (
             {"accepted": 12},
@@ -141,10 +141,10 @@ class TestTrials:
     def test_the_table_says_where_tolerances_come_from(self, made: dict[int | None, Trial]) -> None:
         assert not made
         options = replace(NOISE_ALONE, frame_tolerance_mm=0.1)
-        for own, told in (
+        for own, sentence in (
             ([np.nan] * 6, "rods' ends to 0.1 mm per axis (frame_tolerance_mm)"),
             ([0.25] * 6, "rods' ends to 0.25 mm per axis (frame file)"),
             ([0.25] + [np.nan] * 5, "a 0.25, b 0.1, c 0.1, d 0.1, e 0.1, f 0.1 mm per axis (frame file, frame_toleran"),
         ):
             found = inspected(replace(FRAME, tolerances_mm=np.array(own)), options, count=2)
-            assert told in table_of(found)[1]
+            assert sentence in table_of(found)[1]

@@ -43,17 +43,17 @@ def test_five_rods_among_thirty_spots_are_sure_near_the_pose_before(mm: float, d
     rng = np.random.default_rng(1)
     settings = SpotSetSettings(SCANNER, visible_rods=5, false_spots=25, noise_px=0.5)
     options = replace(PERFECT, spot_noise_px=settings.noise_std_px)
-    told, untold = 0, 0
+    near, alone = 0, 0
     for _ in range(30):
         problem = random_spot_set(rng, CUBE, settings)
         guess = moved(rng, problem.slice_from_frame, mm, degrees)
         result = register_spots(problem.spots_px, CUBE, SCALE, options, previous=guess)
-        told += bool(result)
+        near += bool(result)
         if result:
             assert not is_wrong(result.scanner_from_frame, problem.slice_from_frame)
-        untold += bool(register_spots(problem.spots_px, CUBE, SCALE, options))
-    assert told == 30
-    assert untold < 15
+        alone += bool(register_spots(problem.spots_px, CUBE, SCALE, options))
+    assert near == 30
+    assert alone < 15
 
 
 def test_the_guess_is_of_the_frame_in_the_scanner_whatever_the_slices_plane() -> None:

@@ -145,24 +145,26 @@ def test_frames_that_have_no_names_are_named(names):
 class Told:
     """Stands in for a node that was started with these parameters, beside the defaults."""
 
-    def __init__(self, **told):
-        self.told, self.held = told, {}
+    def __init__(self, **given):
+        self.given, self.held = given, {}
 
     def declare_parameter(self, name, default, _descriptor):
-        self.held[name] = Parameter(name, value=self.told.get(name, default))
+        self.held[name] = Parameter(name, value=self.given.get(name, default))
         return self.held[name]
 
     def get_parameter(self, name):
         return self.held[name]
 
 
-def told(**parameters: Any) -> Any:
+def started_with(**parameters: Any) -> Any:
     """A node for whoever asks for one."""
     return Told(**parameters)
 
 
-def test_a_node_is_as_it_was_told_at_its_start_and_as_it_is_changed():
-    node = told(frame_file="cube5", pixel_spacing=[0.5, 0.7], frame_files=["cube6", "cube8"], calibration_slices=7)
+def test_settings_are_those_given_at_the_start_and_as_changed_since():
+    node = started_with(
+        frame_file="cube5", pixel_spacing=[0.5, 0.7], frame_files=["cube6", "cube8"], calibration_slices=7
+    )
     settings = declare_settings(node)
     assert (settings.frame_file, settings.frame_files) == ("cube5", ("cube6", "cube8"))
     assert (settings.pixel_spacing, settings.calibration.calibration_slices) == ((0.5, 0.7), 7)
@@ -172,7 +174,7 @@ def test_a_node_is_as_it_was_told_at_its_start_and_as_it_is_changed():
     with pytest.raises(ValueError, match="calibration_slices is not set, expected a value"):
         changed_settings(node, [*changes, Parameter("calibration_slices", Parameter.Type.NOT_SET)])
     with pytest.raises(ParameterError, match="pixel_spacing has 1 numbers, expected two"):
-        declare_settings(told(pixel_spacing=[0.5]))
+        declare_settings(started_with(pixel_spacing=[0.5]))
 
 
 @pytest.mark.parametrize(
@@ -204,8 +206,8 @@ def test_the_receiver_tells_clients_their_limits_in_bytes():
 
 
 def test_each_limit_of_the_receiver_has_its_place():
-    told = ReceptionSettings(max_object_mb=1, max_associations=2, association_timeout=3.0, network_timeout=4.0)
-    assert told.limits == Limits(2**20, max_associations=2, association_timeout_s=3.0, network_timeout_s=4.0)
+    settings = ReceptionSettings(max_object_mb=1, max_associations=2, association_timeout=3.0, network_timeout=4.0)
+    assert settings.limits == Limits(2**20, max_associations=2, association_timeout_s=3.0, network_timeout_s=4.0)
 
 
 def test_a_title_of_the_receiver_may_have_sixteen_characters():

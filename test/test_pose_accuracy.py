@@ -30,7 +30,7 @@ def test_spot_sets(case: Case) -> None:
 
 
 def test_rendered_slices() -> None:
-    assert_consistent(measure(RENDERED_CASES[2], 60, 3), 57)
+    assert_consistent(measure(RENDERED_CASES[2], 60, 3), 58)
 
 
 def test_a_wrong_covariance_is_noticed() -> None:

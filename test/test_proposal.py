@@ -79,7 +79,7 @@ class TestProposal:
         assert (found.ambiguous, found.tried, found.interrupted) == (0, 3, False)
         assert [list(one) for one in made.left_out] == [[None, 0, 1, 2, 3]]
         (poses,) = made.poses
-        # Head down, and not turned by more than is told.
+        # Head down, and not turned by more than is allowed.
         assert (poses.rotations[:, 2, 2] < -np.cos(np.radians(20.0)) + 1e-9).all()
         assert (poses.rotations[:, 0, 0] > np.cos(np.radians(20.0)) - 1e-9).all()
         assert -15 <= poses.heights_mm.min() < -14
@@ -115,10 +115,10 @@ class TestProposal:
         np.testing.assert_allclose(found.frame.starts[0, 0], round((0.15 - 0.5) * 59, 1))
         assert made.seeds == [5, 6, 7]
 
-    def test_an_interruption_is_told_whenever_it_comes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_an_interruption_is_reported_whenever_it_comes(self, monkeypatch: pytest.MonkeyPatch) -> None:
         found, _ = proposed(monkeypatch, [[candidate(interrupted=True)]], [])
         assert (found.interrupted, found.tried) == (True, 0)
-        found, _ = proposed(monkeypatch, [[candidate()]], [[RIGHT] * 9], lambda *told: told[0] == "searching")
+        found, _ = proposed(monkeypatch, [[candidate()]], [[RIGHT] * 9], lambda *step: step[0] == "searching")
         assert (found.interrupted, found.tried, found.ambiguous) == (True, 1, 0)
         # One that was tried to its end is better than one that was not tried at all.
         found, _ = proposed(monkeypatch, [[candidate()], [candidate(0.05, True)]], [[RIGHT, AMBIGUOUS]])

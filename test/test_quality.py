@@ -28,8 +28,10 @@ class Overriding:
         return self._overridden(profile)
 
     def _overridden(self, profile: QoSProfile) -> Any:
-        told = profile.depth, profile.durability, profile.history, profile.reliability
-        self.profiles.append(QoSProfile(depth=told[0], durability=told[1], history=told[2], reliability=told[3]))
+        values = profile.depth, profile.durability, profile.history, profile.reliability
+        self.profiles.append(
+            QoSProfile(depth=values[0], durability=values[1], history=values[2], reliability=values[3])
+        )
         profile.depth, profile.durability, profile.reliability = (
             77,
             DurabilityPolicy.VOLATILE,

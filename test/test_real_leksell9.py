@@ -113,11 +113,7 @@ def test_of_two_rods_that_meet_the_one_that_shows_is_not_taken_for_the_other(sli
     ends = [min(slices, key=height_mm), max(slices, key=height_mm)]
     options = RegistrationOptions(threshold=1000.0, max_rotation_deg=30.0)
     for ct_slice in ends:
-        at = project(frame, ct_slice.scanner_from_slice.inverse() @ LEKSELL_POSE, ct_slice.scale)[0]
-        nearest_mm = ct_slice.scale.sx * np.sort(np.linalg.norm(at[:, None] - at, axis=-1), axis=1)[:, 1]
-        meeting = [name for name, mm in zip(frame.line_names, nearest_mm, strict=True) if mm < 25.0]
-        assert len(meeting) == 6
-        for name in meeting:
+        for name in frame.line_names:
             found = changed(find_spots(ct_slice, options), ct_slice, frame, Change((name,)), np.random.default_rng(0))
             result = register_found(found, ct_slice, frame, options, previous)
             if result:

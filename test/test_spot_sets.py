@@ -19,7 +19,7 @@ def drawn(count: int, visible: int, false: int, noise_px: float, gaussian: bool)
 
 
 @pytest.mark.parametrize("gaussian", [False, True])
-def test_noise_is_as_large_as_is_told(gaussian: bool) -> None:
+def test_noise_is_as_large_as_stated(gaussian: bool) -> None:
     settings = SpotSetSettings(SCANNER, 6, 0, 0.4, gaussian)
     off = []
     for one in drawn(150, 6, 0, 0.4, gaussian):

@@ -25,7 +25,7 @@ def test_least_height_is_six_times_the_noise_and_no_less_than_a_unit() -> None:
     assert least_height(0.1) == 1.0
 
 
-def test_the_surroundings_of_a_spot_are_told_by_their_median_and_by_how_far_most_are_from_it() -> None:
+def test_the_surroundings_of_a_spot_are_described_by_their_median_and_by_how_far_most_are_from_it() -> None:
     """Around the first one 10 to 18 HU, and 1000 HU once; around the second nothing."""
     patches = np.full((2, 5, 5), 7.0, np.float32)
     patches[0, 0], patches[0, 1, 0] = [18.0, 10.0, 14.0, 16.0, 12.0], 1000.0

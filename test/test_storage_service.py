@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -93,8 +94,11 @@ def test_as_many_associations_as_are_allowed_and_no_more_until_one_has_ended() -
             assert third.is_rejected
         assert second.send_c_echo().Status == SUCCESS
         first.release()
-        # Its end is noticed a moment later.
-        assert any(echo(port) == SUCCESS for _ in range(200))
+        # Its end is noticed a moment later: on a busy machine, after any number of tries.
+        end_s = time.monotonic() + PATIENCE_S
+        while (status := echo(port)) is None and time.monotonic() < end_s:
+            pass
+        assert status == SUCCESS
 
 
 def test_what_was_announced_as_another_object_or_as_none_is_refused_and_not_kept(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ class TestStarts:
 
 
 class TestAmongItsOwnSpots:
-    def test_what_is_known_is_told_in_terms_of_these_and_back(self) -> None:
+    def test_what_is_known_is_renumbered_for_these_spots_and_back(self) -> None:
         """The spots are in no rod's own row; with the other three rods among all spots, three more must show."""
         order = np.array([5, 3, 1, 4, 0, 2])
         every = searching(spots(np.concatenate([PLACES[order], [[95.0, 90.0], [-10.0, -10.0]]])))
@@ -120,7 +120,7 @@ class TestTwinsOfFrames:
     def test_of_shipped_ones(self, name: str, rods: int, has_twins: bool) -> None:
         assert three_line._has_twins(load_frame(name), rods, 0.25) is has_twins
 
-    def test_it_is_not_known_where_no_slice_shows_so_many_rods(self) -> None:
+    def test_twins_are_assumed_where_no_slice_shows_that_many_rods(self) -> None:
         assert three_line._has_twins(load_frame("cube6"), 7, 0.25)
 
 
@@ -130,7 +130,7 @@ def test_distances_are_known_to_a_tenth_of_a_millimetre_or_worse() -> None:
     assert three_line._tolerance_mm(0.16) == pytest.approx(1.1)
 
 
-def test_told_apart_is_by_so_many_decades(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_explanations_are_told_apart_from_a_number_of_decades_on(monkeypatch: pytest.MonkeyPatch) -> None:
     search = searching(spots())
     monkeypatch.setattr(search, "least_false_alarms", lambda _: -5.0)
     monkeypatch.setattr(search, "false_alarms", lambda _: -9.0)

@@ -111,7 +111,7 @@ def test_is_the_same_every_time() -> None:
 
 
 def tried_for(frame: Frame, rods: int) -> list[tuple[int, int, int]]:
-    """The triples that `triple_order` has tried once every set of so many rods holds one."""
+    """The triples that `triple_order` has tried once every set of that many rods holds one."""
     order = triple_order(frame, MIN_INLIERS)
     return [
         entry.lines for entry in order[: 1 + next(i for i, entry in enumerate(order) if entry.complete_from <= rods)]
@@ -119,7 +119,7 @@ def tried_for(frame: Frame, rods: int) -> list[tuple[int, int, int]]:
 
 
 class TestFurtherTriples:
-    """A second look: every set of rods holds so many triples that were tried, and no triple is tried for nothing."""
+    """A second look: every set of rods holds as many tried triples as it should, and no triple is tried in vain."""
 
     @pytest.mark.parametrize("rods", [4, 5, 6])
     @pytest.mark.parametrize("looks", [2, 3])
