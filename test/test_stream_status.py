@@ -15,19 +15,20 @@ from stereoreg_ros.nodes.stream_status import NAME, StreamStatus
 STALE_S = 10.0
 
 
-def report(stream: StreamStatus, now_s: float, received: int = 0, skipped: int = 0, waiting: int = 0) -> dict[str, str]:
+def report(
+    stream: StreamStatus, now_s: float, received: int = 0, skipped: int = 0, waiting: int = 0, missing: str = ""
+) -> dict[str, str]:
     """What is said: the values, and under "" the level and the message."""
-    status = stream.report(now_s, STALE_S, received, skipped, waiting, "the robot")
+    status = stream.report(now_s, STALE_S, received, skipped, waiting, "the robot", missing)
     assert (status.name, status.hardware_id) == (NAME, "the robot")
-    level = {DiagnosticStatus.OK: "OK", DiagnosticStatus.WARN: "WARN"}[status.level]
+    level = {DiagnosticStatus.OK: "OK", DiagnosticStatus.WARN: "WARN", DiagnosticStatus.ERROR: "ERROR"}[status.level]
     return {"": f"{level}: {status.message}"} | {one.key: one.value for one in status.values}
 
 
-def test_before_the_first_slice_there_is_no_news_and_no_age() -> None:
+def test_before_the_first_slice_it_is_waited_for_and_has_no_age() -> None:
     stream = StreamStatus(100.0)
-    assert not stream.due(1e6, STALE_S)
     said = report(stream, 1e6)
-    assert said[""] == "OK: 0 slices received"
+    assert said[""] == "OK: waiting for the first slice"
     assert (said["last_slice_age_s"], said["latency_ms"], said["latency_max_ms"]) == ("nan", "nan", "nan")
 
 
@@ -58,15 +59,10 @@ def test_counts_are_since_the_start_but_rates_and_latencies_since_the_last_repor
 def test_a_stream_that_stops_is_stale_and_says_so_again_and_again() -> None:
     stream = StreamStatus(0.0)
     stream.registered(50.0, 10.0)
-    assert stream.due(50.0, STALE_S)
     report(stream, 51.0, received=1)
-    assert not stream.due(51.0 + STALE_S, STALE_S)
-    assert stream.due(51.1 + STALE_S, STALE_S)
-    said = report(stream, 61.5, received=1)
-    assert said[""] == "WARN: stale: no slice for 11.5 s"
-    # Once for each such time, not without end.
-    assert not stream.due(71.0, STALE_S)
-    assert stream.due(72.0, STALE_S)
+    assert report(stream, 59.5, received=1)[""] == "OK: 0 slices received"
+    assert report(stream, 61.5, received=1)[""] == "WARN: stale: no slice for 11.5 s"
+    assert report(stream, 62.5, received=1)[""] == "WARN: stale: no slice for 12.5 s"
     # One slice, and it is not.
     stream.registered(72.0, 10.0)
     assert report(stream, 72.5, received=2)[""] == "OK: 1 slices received"
@@ -76,6 +72,15 @@ def test_as_long_as_is_allowed_is_not_stale() -> None:
     stream = StreamStatus(0.0)
     stream.registered(50.0, 10.0)
     assert report(stream, 50.0 + STALE_S, received=1)[""] == "OK: 1 slices received"
+
+
+@pytest.mark.parametrize("has_slices", [False, True])
+def test_what_has_to_be_set_first_is_told_before_all_else(has_slices: bool) -> None:
+    stream = StreamStatus(0.0)
+    if has_slices:
+        stream.registered(1.0, 10.0)
+    said = report(stream, 30.0, received=5, skipped=3, missing="no pixel spacing: set the parameter pixel_spacing")
+    assert said[""] == "ERROR: no pixel spacing: set the parameter pixel_spacing"
 
 
 def test_stale_is_told_before_skipped() -> None:

@@ -179,6 +179,20 @@ class NodeSettings:
         return self.frame_files or (self.frame_file,)
 
     @property
+    def in_force(self) -> str:
+        """The frames, and the limits that a pose and a target have to keep, in one line."""
+        options = self.options
+        within = f"within {options.max_rotation_deg:g} degrees of nominal_orientation"
+        return (
+            f"frame {', '.join(self.frame_sources)}; "
+            f"limits: {within if options.max_rotation_deg < 180.0 else 'any orientation'}, "
+            f"target error up to {options.max_target_error_mm:g} mm, "
+            f"standard deviation of the position up to {options.max_position_std_mm:g} mm, "
+            f"{options.min_inliers} rods or more, false alarms up to 10^{options.max_log10_false_alarms:g}, "
+            f"poses up to {self.max_pose_age:g} s old"
+        )
+
+    @property
     def scale(self) -> PixelScale | None:
         """The pixel scale; None until the spacing was told."""
         return PixelScale(*self.pixel_spacing, self.pixel_shear) if self.pixel_spacing != (0.0, 0.0) else None

@@ -119,7 +119,7 @@ class RegisterNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._scale.load()
-        self.get_logger().info(f"ready, frame {', '.join(self.settings.frame_sources)}")
+        self.get_logger().info(f"ready, {self.settings.in_force}")
 
     @property
     def frame(self) -> Frame | None:
@@ -285,8 +285,6 @@ class RegisterNode(Node):
         now_s = time.monotonic()
         if fault := self._sources.fault(now_s):
             self.get_logger().warning(fault, throttle_duration_sec=_REPEAT_WARNING_S)
-        if not self._stream.due(now_s, self.settings.stale_after):
-            return
         status = self._stream.report(
             now_s,
             self.settings.stale_after,
@@ -294,9 +292,16 @@ class RegisterNode(Node):
             self._backlog.skipped,
             len(self._backlog),
             self.settings.scanner_frame_id,
+            self._missing(),
         )
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=[status]))
+
+    def _missing(self) -> str:
+        """What has to be set before a slice can be registered; empty where nothing has."""
+        if not self._outputs:
+            return f"no frame: {self._frame_fault}"
+        return "no pixel spacing: set the parameter pixel_spacing" if self.settings.scale is None else ""
 
     # The target.
 

@@ -11,6 +11,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
+from stereoreg_ros.nodes.overrides import require_declared
 from stereoreg_ros.nodes.parameters import ParameterError
 
 # A wait without an end at times sleeps through a SIGTERM; this one wakes and looks.
@@ -33,6 +34,7 @@ def run(node_factory: Callable[[], Node]) -> int:
     try:
         executor = SingleThreadedExecutor()
         node = node_factory()
+        require_declared(node)
         _spin(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

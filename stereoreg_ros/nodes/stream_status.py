@@ -28,20 +28,29 @@ class StreamStatus:
         self._registered += 1
         self._latencies_ms.append(latency_ms)
 
-    def due(self, now_s: float, stale_after_s: float) -> bool:
-        """Whether there is news: slices since the last report, or none for too long since the last slice or report."""
-        if self._latencies_ms:
-            return True
-        return self._last_slice_s is not None and now_s - max(self._last_slice_s, self._reported_s) > stale_after_s
-
     def report(
-        self, now_s: float, stale_after_s: float, received: int, skipped: int, waiting: int, hardware_id: str
+        self,
+        now_s: float,
+        stale_after_s: float,
+        received: int,
+        skipped: int,
+        waiting: int,
+        hardware_id: str,
+        missing: str,
     ) -> DiagnosticStatus:
-        """The status since the last report; received, skipped, waiting: images since the start, and now."""
+        """The status since the last report.
+
+        received, skipped, waiting: images since the start, and now; missing: what has to be set before any slice can be
+        registered, as a phrase, empty where nothing has.
+        """
         age_s = now_s - self._last_slice_s if self._last_slice_s is not None else math.nan
         known = [latency for latency in self._latencies_ms if not math.isnan(latency)]
         skipped_now = skipped - self._reported[1]
-        if age_s > stale_after_s:
+        if missing:
+            level, message = DiagnosticStatus.ERROR, missing
+        elif self._last_slice_s is None:
+            level, message = DiagnosticStatus.OK, "waiting for the first slice"
+        elif age_s > stale_after_s:
             level, message = DiagnosticStatus.WARN, f"stale: no slice for {age_s:.1f} s"
         elif skipped_now:
             level, message = DiagnosticStatus.WARN, f"{skipped_now} slices skipped: they come faster than registered"
