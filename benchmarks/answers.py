@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 
-from stereoreg_ros.nodes.diagnostic_status import NAME
+from stereoreg_ros.nodes.diagnostic_status import NAME, name_of_status
 
 DEEP: Final = QoSProfile(depth=1000)
 
@@ -58,7 +58,7 @@ class Listener(Node):
     def on_diagnostics(self, message: DiagnosticArray) -> None:
         """Statuses have come, of a slice or of something else."""
         for status in message.status:
-            if status.name == NAME:
+            if status.name == name_of_status("register_node", NAME):
                 stamp = nanoseconds(message)
                 self.heard.statuses[stamp] = time.time_ns()
                 values = {pair.key: pair.value for pair in status.values}

@@ -19,6 +19,7 @@ from network_hosts import INTERFACE, Hosts, hosts
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 import ros_process
+from contract import STATUS_NAME
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian
@@ -31,7 +32,6 @@ from test_register_node import SCALE, assert_near, rendered
 from benchmarks.process_memory import memory_kib
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.nodes.conversions import pose_from_message
-from stereoreg_ros.nodes.diagnostic_status import NAME as REGISTRATION
 
 RECEPTION, REGISTERING, CONTROL = HOSTS = ("reception", "registering", "control")
 SLICES = [rendered(seed, noise_hu=5.0) for seed in range(40, 48)]
@@ -104,7 +104,7 @@ class Site:
 
     def statuses(self) -> list[tuple[float, DiagnosticStatus]]:
         """Of slices, that the controller has heard, each with its stamp."""
-        return [(seconds(one.header), one.status[0]) for one in self.diagnostics if one.status[0].name == REGISTRATION]
+        return [(seconds(one.header), one.status[0]) for one in self.diagnostics if one.status[0].name == STATUS_NAME]
 
     @property
     def pose_age_s(self) -> float:

@@ -14,6 +14,7 @@ from real_images import CATPHAN_OPTIONS
 
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
+from contract import STATUS_NAME
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import SetParametersResult
@@ -30,7 +31,7 @@ from test_register_node import SCALE, Bench, image_of, of_stamp, rendered
 from stereoreg_ros import PixelScale, load_frame, register_slice
 from stereoreg_ros.dicom import read_series
 from stereoreg_ros.nodes.conversions import pose_from_message
-from stereoreg_ros.nodes.diagnostic_status import NAME, OTHER_SPACING
+from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING
 from stereoreg_ros.nodes.tell_spacing import SpacingTeller
 
 IMAGE = np.zeros((64, 64), np.uint16)
@@ -63,7 +64,7 @@ class Registered:
     @property
     def messages(self) -> list[DiagnosticArray]:
         # The status of the stream bears the time of its report.
-        of_images = [one for one in self._heard if one.status[0].name == "register_node: registration"]
+        of_images = [one for one in self._heard if one.status[0].name == STATUS_NAME]
         by_stamp = {(one.header.stamp.sec, one.header.stamp.nanosec): one for one in of_images}
         return [message for (sec, _), message in by_stamp.items() if sec > 0]
 
@@ -209,7 +210,7 @@ class SlowRegisterNode:
         sx, sy = self.spacings[-1]
         values = {"calibration": calibration, "pixel_spacing_x_mm": str(sx), "pixel_spacing_y_mm": str(sy)}
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        status = DiagnosticStatus(name=NAME, message=message, values=pairs)
+        status = DiagnosticStatus(name=STATUS_NAME, message=message, values=pairs)
         self._answers.publish(DiagnosticArray(header=Header(stamp=self.stamps[number]), status=[status]))
 
 

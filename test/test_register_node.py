@@ -80,6 +80,10 @@ class Bench:
         # The last, as DDS announces in order: whom the node tells a status has its poses too.
         self.diagnostics = client.collect(DiagnosticArray, "/diagnostics")
 
+    def name_of(self, what: str) -> str:
+        """Name of a status of the node."""
+        return f"{self.node.lstrip('/')}: {what}"
+
     def next_stamp(self) -> Time:
         return Time(sec=next(self._stamps), nanosec=1)
 
@@ -94,7 +98,7 @@ class Bench:
         what = "the diagnostics of an image"
         array = self.client.wait_for(lambda: of_stamp(self.diagnostics, stamp), what, deadline_s)
         (status,) = array.status
-        assert status.name == "register_node: registration"
+        assert status.name == self.name_of("registration")
         assert [pair.key for pair in status.values] == DIAGNOSTIC_KEYS
         for pair in status.values:
             if pair.key in NUMBERS:
@@ -176,7 +180,7 @@ class Bench:
 
         def told() -> list[DiagnosticStatus]:
             statuses = [status for array in self.diagnostics for status in array.status]
-            ours = [status for status in statuses if status.name == "register_node: target"]
+            ours = [status for status in statuses if status.name == self.name_of("target")]
             return [status for status in ours if axes in status.message or axes == status.hardware_id]
 
         return values_of(self.client.wait_for(told, f"a status of the target in {axes}")[-1])["reason"]

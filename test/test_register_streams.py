@@ -102,7 +102,7 @@ def test_two_frames_have_topics_and_statuses_of_their_own(client):
         assert spots >= 14
 
 
-NAMES = tuple(f"register_node: registration of {name}" for name in ("cube6", "cube8"))
+NAMES = tuple(f"both/register_node: registration of {name}" for name in ("cube6", "cube8"))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_target_error_and_age(streams):
     streams.client.publish(f"{streams.namespace}/target", target_of(target))
 
     def of_this_target() -> list[DiagnosticStatus]:
-        told = statuses(streams.diagnostics, "register_node: target")
+        told = statuses(streams.diagnostics, streams.name_of("target"))
         return [one for one in told if abs(float(values_of(one)["target_x_mm"]) - in_frame[0]) < 1e-6]
 
     status = streams.client.wait_for(of_this_target, "the target's status")[-1]
@@ -189,7 +189,7 @@ def test_target_on_a_pose_that_will_not_do(streams, settings, reason):
     assert streams.set(**settings) == ""
     streams.client.publish(f"{streams.namespace}/target", target_of([1.0, 2.0, 3.0]))
     (status,) = streams.client.wait_for(
-        lambda: statuses(streams.diagnostics, "register_node: target")[:1], "the target's status"
+        lambda: statuses(streams.diagnostics, streams.name_of("target"))[:1], "the target's status"
     )
     assert status.level == DiagnosticStatus.ERROR
     assert values_of(status)["reason"] == reason
@@ -243,7 +243,7 @@ def test_slices_that_have_waited_too_long_are_skipped_for_the_newest_and_counted
         bench.status(late[-1], 90.0)
 
         def skipped() -> int:
-            told = [values_of(one) for one in statuses(bench.diagnostics, "register_node: stream")]
+            told = [values_of(one) for one in statuses(bench.diagnostics, bench.name_of("stream"))]
             return int(told[-1]["slices_skipped"]) if told else 0
 
         client.wait_for(skipped, "skipped slices in the stream's status")
@@ -252,7 +252,7 @@ def test_slices_that_have_waited_too_long_are_skipped_for_the_newest_and_counted
         reasons = [values_of(answer.status[0])["reason"] for answer in answers]
 
         def heard_skipped() -> int:
-            heard = statuses(bench.diagnostics, "register_node: registration")
+            heard = statuses(bench.diagnostics, bench.name_of("registration"))
             return [values_of(one)["reason"] for one in heard].count("skipped")
 
         # On a busy computer, some of those before were skipped too; the stream's status comes once a second.
@@ -261,7 +261,7 @@ def test_slices_that_have_waited_too_long_are_skipped_for_the_newest_and_counted
         assert reasons[-1] != "skipped"
 
         def all_told() -> bool:
-            last = values_of(statuses(bench.diagnostics, "register_node: stream")[-1])
+            last = values_of(statuses(bench.diagnostics, bench.name_of("stream"))[-1])
             told = int(last["slices_registered"]) + int(last["slices_skipped"])
             return int(last["slices_received"]) == told >= len(late)
 
@@ -282,12 +282,12 @@ def test_stream_that_stops_is_told_as_stale(streams):
     streams.diagnostics.clear()
 
     def warned() -> list[DiagnosticStatus]:
-        told = statuses(streams.diagnostics, "register_node: stream")
+        told = statuses(streams.diagnostics, streams.name_of("stream"))
         return [status for status in told if status.level == DiagnosticStatus.WARN]
 
     status = streams.client.wait_for(warned, "a warning that the stream is stale")[0]
     assert status.message.startswith("stale: no slice for ")
-    with_latency = [values_of(one) for one in statuses(streams.diagnostics, "register_node: stream")]
+    with_latency = [values_of(one) for one in statuses(streams.diagnostics, streams.name_of("stream"))]
     known = [float(one["latency_ms"]) for one in with_latency if one["latency_ms"] != "nan"]
     assert all(0 < latency < 20_000 for latency in known)
 

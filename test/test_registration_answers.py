@@ -10,11 +10,12 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from builtin_interfaces.msg import Time
+from contract import STATUS_NAME
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.diagnostic_status import NAME, OTHER_SPACING
+from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING
 from stereoreg_ros.nodes.registration_answers import RegistrationAnswers
 
 STAMP = Time(sec=5, nanosec=7)
@@ -24,10 +25,13 @@ SCALE = PixelScale(0.5, 0.6)
 class Heard:
     """Answers that are heard without a node."""
 
-    def __init__(self) -> None:
-        node: Any = SimpleNamespace(create_subscription=self._subscribe)
-        self.answers = RegistrationAnswers(node)
-        self.answers.expect(STAMP)
+    def __init__(
+        self, register_node: str = "register_node", namespace: str = "/", expected: Time | None = STAMP
+    ) -> None:
+        node: Any = SimpleNamespace(create_subscription=self._subscribe, get_namespace=lambda: namespace)
+        self.answers = RegistrationAnswers(node, register_node)
+        if expected is not None:
+            self.answers.expect(expected)
 
     def _subscribe(self, _type: type, topic: str, callback: Any, _queue: int) -> None:
         assert topic == "/diagnostics"
@@ -38,7 +42,10 @@ class Heard:
 
 
 def status(
-    name: str = NAME, message: str = "", calibration: str = "configured", spacing: tuple[float, float] = (0.5, 0.6)
+    name: str = STATUS_NAME,
+    message: str = "",
+    calibration: str = "configured",
+    spacing: tuple[float, float] = (0.5, 0.6),
 ) -> DiagnosticStatus:
     values = {
         "calibration": calibration,
@@ -64,9 +71,30 @@ def test_only_answers_with_the_stamp_of_the_slice_count() -> None:
     assert heard.answers.count == 0
 
 
+@pytest.mark.parametrize(
+    ("register_node", "namespace", "name"),
+    [
+        ("register_node", "/", "register_node"),
+        ("register_node", "/robot1", "robot1/register_node"),
+        ("/register_node", "/robot1", "register_node"),
+        ("robot2/register_node", "/", "robot2/register_node"),
+        ("/robot2/register_node", "/robot1", "robot2/register_node"),
+    ],
+)
+def test_only_answers_of_the_node_that_is_waited_for_count(register_node: str, namespace: str, name: str) -> None:
+    """Another one registers slices with the same stamps: with its answer, a slice of ours would never be registered."""
+    heard = Heard(register_node, namespace)
+    for other in {"register_node", "robot1/register_node", "robot2/register_node", "robot3/register_node"} - {name}:
+        heard.answer(status(f"{other}: registration"), status(f"{other}: registration of cube6"))
+    heard.answer(status(f"{name}: registrations"), status(f"{name}: stream"))
+    assert heard.answers.count == 0
+    heard.answer(status(f"{name}: registration"))
+    heard.answer(status(f"{name}: registration of cube6"), status(f"{name}: registration of cube8"))
+    assert heard.answers.count == 2
+
+
 def test_before_a_slice_is_expected_nothing_counts() -> None:
-    heard = Heard()
-    heard.answers = RegistrationAnswers(SimpleNamespace(create_subscription=heard._subscribe))  # type: ignore[arg-type]
+    heard = Heard(expected=None)
     heard.answer(status(), stamp=Time())
     assert heard.answers.count == 0
 
@@ -75,8 +103,8 @@ def test_of_several_frames_there_is_one_answer_by_the_first() -> None:
     heard = Heard()
     heard.answer(
         status("register_node: stream"),
-        status(f"{NAME} cube6", spacing=(0.5, 0.6)),
-        status(f"{NAME} cube8", spacing=(0.7, 0.7)),
+        status(f"{STATUS_NAME} of cube6", spacing=(0.5, 0.6)),
+        status(f"{STATUS_NAME} of cube8", spacing=(0.7, 0.7)),
     )
     assert heard.answers.count == 1
     assert heard.answers.came_with(SCALE)

@@ -27,6 +27,7 @@ from sensor_msgs.msg import Image
 
 from stereoreg_ros.geometry.pose import Pose, rotation_angle
 from stereoreg_ros.nodes.conversions import pose_from_message
+from stereoreg_ros.nodes.diagnostic_status import NAME, name_of_status
 
 # What the demonstration counts as a wrong pose.
 WRONG_MM, WRONG_DEG = 1.5, 2.0
@@ -95,7 +96,7 @@ class _Listener(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == "register_node: registration":
+            if status.name == name_of_status("register_node", NAME):
                 self._slice(message).values = {entry.key: entry.value for entry in status.values}
 
     def _on_overlay(self, message: Image) -> None:

@@ -1,4 +1,4 @@
-"""What `/diagnostics` says about one image."""
+"""What `/diagnostics` says about one image; the node puts its name before those of the statuses."""
 
 from __future__ import annotations
 
@@ -10,9 +10,17 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from stereoreg_ros.result import Reason, Refusal, Registration, diagnostics
 
-NAME: Final = "register_node: registration"
+NAME: Final = "registration"
 # How the message begins that refuses an image with another pixel spacing than the one told.
 OTHER_SPACING: Final = "the slice's pixel spacing is"
+
+
+def name_of_status(node_name: str, what: str) -> str:
+    """Name of a status: the fully qualified name of the node that it is of, and what it is about.
+
+    Two nodes in two namespaces would take each other's place in a table that goes by the name.
+    """
+    return f"{node_name.lstrip('/')}: {what}"
 
 
 def status_of(

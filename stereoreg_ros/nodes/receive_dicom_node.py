@@ -50,7 +50,7 @@ class ReceiveDicomNode(Node):
         self._teller = (
             SpacingTeller(self, settings.register_node, with_slice_poses=True) if settings.register_node else None
         )
-        self._answers = RegistrationAnswers(self)
+        self._answers = RegistrationAnswers(self, settings.register_node)
         self._sent: ReceivedSlice | None = None
         self._sent_stamp = TimeMessage()
         self._answer_by_s = 0.0

@@ -12,6 +12,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped, Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
@@ -32,7 +33,7 @@ from stereoreg_ros.nodes import conversions
 from stereoreg_ros.nodes.backlog import MOST_WAIT_S, Backlog, received_s, waiting_in
 from stereoreg_ros.nodes.companion import Companion
 from stereoreg_ros.nodes.conversions import MessageError
-from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING, status_of, status_of_unusable
+from stereoreg_ros.nodes.diagnostic_status import OTHER_SPACING, name_of_status, status_of, status_of_unusable
 from stereoreg_ros.nodes.frame_output import FrameOutput, FrameTopics
 from stereoreg_ros.nodes.image_sources import ImageSources
 from stereoreg_ros.nodes.markers import markers_of
@@ -254,7 +255,12 @@ class RegisterNode(Node):
                 frame = next(pair.value for pair in status.values if pair.key == "frame")
                 status.name = f"{status.name} of {frame}"
         # The image's stamp, so that a status can be laid beside its pose.
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=header.stamp), status=statuses))
+        self._diagnose(statuses, header.stamp)
+
+    def _diagnose(self, statuses: list[DiagnosticStatus], stamp: Time) -> None:
+        for status in statuses:
+            status.name = name_of_status(self.get_fully_qualified_name(), status.name)
+        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=statuses))
 
     def _count(self, header: Header) -> None:
         """Count a slice that was answered, with its latency."""
@@ -294,8 +300,7 @@ class RegisterNode(Node):
             self.settings.scanner_frame_id,
             self._missing(),
         )
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=[status]))
+        self._diagnose([status], self.get_clock().now().to_msg())
 
     def _missing(self) -> str:
         """What has to be set before a slice can be registered; empty where nothing has."""
@@ -332,8 +337,7 @@ class RegisterNode(Node):
             statuses.append(status_of_target(outcome, output.frame.name, self._target_axes()))
             if self._target is None:
                 break
-        stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=statuses))
+        self._diagnose(statuses, self.get_clock().now().to_msg())
 
     def _target_axes(self) -> str:
         return self._target.header.frame_id if self._target is not None else ""

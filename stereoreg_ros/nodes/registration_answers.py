@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.diagnostic_status import NAME, OTHER_SPACING
+from stereoreg_ros.nodes.diagnostic_status import NAME, OTHER_SPACING, name_of_status
 
 _QUEUE = 10
 _SAME_SPACING = 1e-4
@@ -20,7 +20,10 @@ class RegistrationAnswers:
     count: of its answers so far, registered or refused.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, register_node: str) -> None:
+        """register_node: its name, seen from the namespace of `node`."""
+        full_name = register_node if register_node.startswith("/") else f"{node.get_namespace()}/{register_node}"
+        self._name = name_of_status(full_name, NAME)
         self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _QUEUE)
         self._stamp: Time | None = None
         self.count = 0
@@ -47,7 +50,7 @@ class RegistrationAnswers:
             return
         for status in message.status:
             # Of several frames each has a status, under the same name and its own; the first stands for all.
-            if status.name.startswith(NAME):
+            if status.name == self._name or status.name.startswith(f"{self._name} of "):
                 self.count += 1
                 values = {one.key: one.value for one in status.values}
                 self._refused_for_spacing = status.message.startswith(OTHER_SPACING)

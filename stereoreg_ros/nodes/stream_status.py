@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from stereoreg_ros.nodes.diagnostic_status import status_with
 
-NAME: Final = "register_node: stream"
+NAME: Final = "stream"
 
 
 class StreamStatus:

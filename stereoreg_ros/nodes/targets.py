@@ -17,7 +17,7 @@ from stereoreg_ros.nodes.diagnostic_status import status_with
 from stereoreg_ros.result import Registration
 from stereoreg_ros.uncertainty import error_ball_95, point_covariance
 
-NAME: Final = "register_node: target"
+NAME: Final = "target"
 
 
 @dataclass(frozen=True, eq=False)
