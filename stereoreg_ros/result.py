@@ -25,6 +25,7 @@ Reason = Literal[
     "bad_image",
     "bad_frame",
     "skipped",
+    "internal_error",
 ]
 REASONS: Final[tuple[Reason, ...]] = (
     "too_few_spots",
@@ -36,6 +37,7 @@ REASONS: Final[tuple[Reason, ...]] = (
     "bad_image",
     "bad_frame",
     "skipped",
+    "internal_error",
 )
 
 

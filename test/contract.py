@@ -32,6 +32,7 @@ REASONS = [
     "bad_image",
     "bad_frame",
     "skipped",
+    "internal_error",
 ]
 
 PUBLISHED = {

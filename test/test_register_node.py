@@ -728,6 +728,6 @@ def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
         node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
         node._on_image(image_of(rendered(19)[0]), {"received_timestamp": time.time_ns()})
     (status,) = published
-    assert values_of(status)["reason"] == "bad_image"
-    assert status.message == "internal error: RuntimeError: out of luck"
+    assert values_of(status)["reason"] == "internal_error"
+    assert status.message.startswith("internal error: RuntimeError: out of luck; please report it")
     assert "Traceback" in capfd.readouterr().err

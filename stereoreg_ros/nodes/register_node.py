@@ -187,7 +187,8 @@ class RegisterNode(Node):
             return
         except Exception as error:
             self.get_logger().error(f"internal error while registering an image\n{traceback.format_exc()}")
-            self._refuse_unusable("bad_image", f"internal error: {type(error).__name__}: {error}", header, started)
+            message = f"internal error: {type(error).__name__}: {error}; please report it with the node's log"
+            self._refuse_unusable("internal_error", message, header, started)
             return
         if len(results[0].spots_px) >= self.settings.options.min_inliers:
             plane, stated = ct_slice.scanner_from_slice, unregistered.spacing
