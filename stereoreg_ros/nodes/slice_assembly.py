@@ -54,7 +54,10 @@ class SliceAssembly:
     """
 
     def __init__(self) -> None:
-        self._parts: dict[str, OrderedDict[_Stamp, Part | MessageError]] = {SPACING: OrderedDict(), PLANE: OrderedDict()}
+        self._parts: dict[str, OrderedDict[_Stamp, Part | MessageError]] = {
+            SPACING: OrderedDict(),
+            PLANE: OrderedDict(),
+        }
         self._waiting: list[_Waiting] = []
 
     def add_image(self, image: Image, received_s: float, expected: Iterable[str]) -> None:
