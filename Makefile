@@ -69,8 +69,10 @@ $(INSTALLED): requirements.txt
 	.venv/bin/python -m pip install --quiet --requirement requirements.txt
 	@touch $@
 
+# Benchmarks and fuzzer share test/support with the tests.
 $(LINKED): $(INSTALLED) setup.py setup.cfg
 	.venv/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@echo '$(CURDIR)/test' > "$$(.venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/stereoreg_ros_test.pth"
 	@touch $@
 
 # From nothing, so that a removed module is not found in an old build.
@@ -81,8 +83,8 @@ $(BUILT): $(INSTALLED) $(SOURCES) | $(LINKED)
 
 catphan: $(CATPHAN)
 
-$(CATPHAN): test/fetch_catphan.py | $(INSTALLED)
-	.venv/bin/python test/fetch_catphan.py $(@D)
+$(CATPHAN): test/support/fetch_catphan.py | $(INSTALLED)
+	.venv/bin/python test/support/fetch_catphan.py $(@D)
 	@touch $@
 
 debian: $(DEBIAN)

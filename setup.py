@@ -32,11 +32,11 @@ setup(
     entry_points={
         "console_scripts": [
             "stereoreg = stereoreg_ros.cli:main",
-            "register_node = stereoreg_ros.nodes.register_node:main",
-            "simulate_node = stereoreg_ros.nodes.simulate_node:main",
-            "play_dicom_node = stereoreg_ros.nodes.play_dicom_node:main",
-            "receive_dicom_node = stereoreg_ros.nodes.receive_dicom_node:main",
-            "demo_report = stereoreg_ros.nodes.demo_report:main",
+            "register_node = stereoreg_ros.nodes.register.register_node:main",
+            "simulate_node = stereoreg_ros.nodes.scanner.simulate_node:main",
+            "play_dicom_node = stereoreg_ros.nodes.scanner.play_dicom_node:main",
+            "receive_dicom_node = stereoreg_ros.nodes.scanner.receive_dicom_node:main",
+            "demo_report = stereoreg_ros.nodes.demo.demo_report:main",
         ],
     },
 )

@@ -14,13 +14,14 @@ import cv2
 import numpy as np
 import scipy
 
-from benchmarks import artefacts, spots
+from benchmarks import spots
 from benchmarks.matching import BASELINE_FALSE_SPOTS, PROBLEMS, measure, measure_baseline
 from benchmarks.yardstick import Yardstick, seconds_of
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.options import AUTO
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 from stereoreg_ros.spots import find_spots
+from support import artefacts
 
 
 def main() -> int:

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 
-from stereoreg_ros.nodes.diagnostic_status import NAME, name_of_status
+from stereoreg_ros.nodes.common.diagnostic_status import NAME, name_of_status
 
 DEEP: Final = QoSProfile(depth=1000)
 

@@ -25,7 +25,7 @@ def main() -> int:
     seconds, bad = [], 0
     environment = os.environ | {"PYTHONUNBUFFERED": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     for _ in tqdm(range(arguments.rounds), disable=None, leave=False):
-        command = [sys.executable, "-m", "stereoreg_ros.nodes.register_node", "--ros-args", "-p"]
+        command = [sys.executable, "-m", "stereoreg_ros.nodes.register.register_node", "--ros-args", "-p"]
         # With a spacing the node is filling tables just before it is ready.
         node = subprocess.Popen(
             [*command, "pixel_spacing:=[0.5,0.5]"], stderr=subprocess.PIPE, env=environment, text=True

@@ -9,11 +9,11 @@ import numpy as np
 from tqdm import tqdm
 
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
-from stereoreg_ros.design.ambiguity import reasons, trials
-from stereoreg_ros.design.expected_error import Imaging
-from stereoreg_ros.design.layouts import Envelope, Layouts, gaps
-from stereoreg_ros.design.meeting import meetings
-from stereoreg_ros.design.search import Wish, random_layouts
+from stereoreg_ros.frames.ambiguity import reasons, trials
+from stereoreg_ros.frames.design_search import Wish, random_layouts
+from stereoreg_ros.frames.expected_error import Imaging
+from stereoreg_ros.frames.layouts import Envelope, Layouts, gaps
+from stereoreg_ros.frames.meeting import meetings
 
 # What cube5 and cube8 were designed for; see the comments in their files.
 ENVELOPE = Envelope((60.0, 60.0, 60.0), 5.0)

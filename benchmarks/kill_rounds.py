@@ -18,11 +18,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-# The tests have the clients, and the judge.
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
-
-from kill_rounds import WRONG_DEG, WRONG_MM, KillRounds, Tally, Victim
-from ros_process import RosClient
+from support.kill_rounds import WRONG_DEG, WRONG_MM, KillRounds, Tally, Victim
+from support.ros_process import RosClient
 
 _SHOWN = 20
 

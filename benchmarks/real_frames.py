@@ -23,7 +23,11 @@ import numpy as np
 from scipy.stats import binom
 from tqdm import tqdm
 
-from benchmarks.real_scenes import (
+from stereoreg_ros import RegistrationOptions
+from stereoreg_ros.options import AUTO
+from stereoreg_ros.result import PoseEstimate, Refusal, Registration
+from stereoreg_ros.uncertainty import error_ball_95
+from support.real_scenes import (
     CATPHAN_PYLINAC,
     CATPHAN_SECOND,
     PRIOR_DEG,
@@ -39,10 +43,6 @@ from benchmarks.real_scenes import (
     turn_deg,
     zframe_scenes,
 )
-from stereoreg_ros import RegistrationOptions
-from stereoreg_ros.options import AUTO
-from stereoreg_ros.result import PoseEstimate, Refusal, Registration
-from stereoreg_ros.uncertainty import error_ball_95
 
 # A pose is wrong where it is off by more than its row allows and by more than so many times the stated 95 % radius.
 _BEYOND = 2.0

@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice
-from stereoreg_ros.calibration import Calibration, Sighting, calibrate, sighting_of
+from stereoreg_ros.calibration.calibrate import Calibration, Sighting, calibrate, sighting_of
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice

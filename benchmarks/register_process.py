@@ -29,7 +29,7 @@ class RegisterProcess:
         scale = SCANNER.scale
         self._log = log
         begun = time.monotonic()
-        command = [sys.executable, "-m", "stereoreg_ros.nodes.register_node"]
+        command = [sys.executable, "-m", "stereoreg_ros.nodes.register.register_node"]
         command += ["--ros-args", "-p", f"pixel_spacing:=[{scale.sx}, {scale.sy}]", "-p", "max_rotation_deg:=30.0"]
         self._popen = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         while _READY not in self.output:

@@ -24,7 +24,7 @@ from sensor_msgs.msg import Image
 
 from stereoreg_ros import load_frame
 from stereoreg_ros.geometry.pose import Pose
-from stereoreg_ros.nodes.conversions import image_from_hu, pose_to_message
+from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, passage, random_pose, render_slice
 
 # Discovery is not what is measured: the first slices are for finding each other.

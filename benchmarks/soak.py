@@ -31,15 +31,15 @@ from geometry_msgs.msg import PoseStamped
 from tqdm import tqdm
 
 from benchmarks.answers import Listener, nanoseconds
-from benchmarks.pose_statistics import pose_error
-from benchmarks.process_memory import memory_kib
 from benchmarks.register_process import DEADLINE_S, RegisterProcess
 from benchmarks.slice_source import TRUTH_QOS, WARM_UP
-from benchmarks.soak_verdict import JUDGED_FROM_S, Sample, Verdict, Window, verdict_of, windows_of
 from benchmarks.yardstick import Yardstick
 from stereoreg_ros.geometry.pose import Pose
-from stereoreg_ros.nodes.conversions import pose_from_message
-from stereoreg_ros.nodes.demo_report import WRONG_DEG, WRONG_MM
+from stereoreg_ros.nodes.common.conversions import pose_from_message
+from stereoreg_ros.nodes.demo.demo_report import WRONG_DEG, WRONG_MM
+from support.pose_statistics import pose_error
+from support.process_memory import memory_kib
+from support.soak_verdict import JUDGED_FROM_S, Sample, Verdict, Window, verdict_of, windows_of
 
 _PASSAGES: Final = 5
 _SAMPLE_S: Final = 2.0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from benchmarks.soak_verdict import Sample, Verdict, Window
+from support.soak_verdict import Sample, Verdict, Window
 
 
 def draw_soak(samples: Sequence[Sample], windows: Sequence[Window], verdict: Verdict, path: Path) -> None:

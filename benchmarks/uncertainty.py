@@ -24,14 +24,14 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.pose_statistics import PoseStatistics
-from benchmarks.rod_layouts import best_subset, well_conditioned_frame
-from benchmarks.worst_cases import WorstCaseCount, count_worst_cases
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
+from support.pose_statistics import PoseStatistics
+from support.rod_layouts import best_subset, well_conditioned_frame
+from support.worst_cases import WorstCaseCount, count_worst_cases
 
 _BATCH = 250
 # The ball holds 95 % of the errors, give or take so many, of spot sets and of rendered slices.

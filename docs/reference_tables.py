@@ -23,11 +23,12 @@ from sphinx.util.docutils import SphinxDirective
 
 from stereoreg_ros import PixelScale, load_frame, register_spots
 from stereoreg_ros.cli import main as command_line
-from stereoreg_ros.nodes import parameters, play_dicom_node
-from stereoreg_ros.nodes.parameters import Entry, entries_of
-from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
-from stereoreg_ros.nodes.register_node import RegisterNode
-from stereoreg_ros.nodes.simulate_node import SimulationSettings
+from stereoreg_ros.nodes.register import parameters
+from stereoreg_ros.nodes.register.parameters import Entry, entries_of
+from stereoreg_ros.nodes.register.register_node import RegisterNode
+from stereoreg_ros.nodes.scanner import play_dicom_node
+from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings
+from stereoreg_ros.nodes.scanner.simulate_node import SimulationSettings
 from stereoreg_ros.result import REASONS, diagnostics
 
 README = Path(__file__).parent.parent / "README.md"

@@ -11,7 +11,7 @@ import numpy as np
 
 from fuzzing.kind import Kind
 from fuzzing.mutation import mutate_text
-from stereoreg_ros.calibration_file import CalibrationFileError, CalibrationRecord, load_calibration, save_calibration
+from stereoreg_ros.calibration.file import CalibrationFileError, CalibrationRecord, load_calibration, save_calibration
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.uncertainty import checked_scale_covariance
 

@@ -18,7 +18,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.nodes.conversions import MessageError, hu_from_image, image_from_hu
+from stereoreg_ros.nodes.common.conversions import MessageError, hu_from_image, image_from_hu
 from stereoreg_ros.options import AUTO, RegistrationOptions
 from stereoreg_ros.registration import prepare, register_frames
 from stereoreg_ros.result import REASONS

@@ -22,9 +22,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from fuzzing.kind import Kind
 from fuzzing.mutation import mutate_bytes
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
-from stereoreg_ros.nodes import reception_parameters
-from stereoreg_ros.nodes.parameters import ENTRIES, changed_settings, declare_settings
-from stereoreg_ros.nodes.reception_parameters import ReceptionSettings
+from stereoreg_ros.nodes.register.parameters import ENTRIES, changed_settings, declare_settings
+from stereoreg_ros.nodes.scanner import reception_parameters
+from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings
 
 _NAMES: Final = tuple(entry.name for entry in ENTRIES)
 _RECEPTION: Final = {entry.name: entry for entry in reception_parameters.ENTRIES}

@@ -29,14 +29,14 @@ from stereoreg_ros.judgement import (
     other_scale,
     second_frame,
 )
-from stereoreg_ros.matching import maurin2009, three_line
+from stereoreg_ros.matching import by_levels, maurin2009
+from stereoreg_ros.matching.by_levels import SearchGivenUpError, find_better
 from stereoreg_ros.matching.consensus import decades_apart, score
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.near import match_near
 from stereoreg_ros.matching.other_scale import with_other_scale
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots, Streaks, whitening_of
-from stereoreg_ros.matching.three_line import SearchGivenUpError, find_better
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Recognition, Refusal, Registration
@@ -44,7 +44,7 @@ from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
 from stereoreg_ros.spots import FoundSpots, find_spots
 from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, enclosing_covariance, in_scanner_axes
 
-_MATCHERS = {"three_line": three_line.match, "maurin2009": maurin2009.match}
+_MATCHERS = {"three_line": by_levels.match, "maurin2009": maurin2009.match}
 # An explanation that chance brings more often (log10) speaks against no other.
 _LOG10_RIVAL = -3.0
 # A second frame of the same kind is looked for that shows as many rods as the first one, or one less.
@@ -63,7 +63,7 @@ def preparation(frame: Frame, scale: PixelScale, options: RegistrationOptions | 
     if options.matcher == "three_line":
         noise_mm = options.spot_noise_px * max(scale.sx, scale.sy)
         extent_mm = _tolerances(frame, scale, options, None).extent_mm
-        yield from three_line.preparation(frame, math.hypot(noise_mm, extent_mm), options)
+        yield from by_levels.preparation(frame, math.hypot(noise_mm, extent_mm), options)
 
 
 def register_slice(
@@ -208,7 +208,7 @@ def recognise_spots(
     if check_orientation(frame, options) or check_count(len(seen.spots_px), options):
         return None
     spots, prior = _sought(seen, frame, options)
-    found = three_line.match_most(spots, frame, prior, options)
+    found = by_levels.match_most(spots, frame, prior, options)
     if not found:
         return None
     estimate = _estimate(found[0], False, spots, frame, seen)

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Header
 
 from stereoreg_ros.dicom import read_series
-from stereoreg_ros.nodes.conversions import image_from_hu, pose_to_message
+from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message
 
 
 def main() -> None:

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from stereoreg_ros.calibration import Calibration
-from stereoreg_ros.calibration_series import SeriesScale, scale_of_series
+from stereoreg_ros.calibration.calibrate import Calibration
+from stereoreg_ros.calibration.series import SeriesScale, scale_of_series
 from stereoreg_ros.cli.output import NAME_WIDTH, complain, print_line, progress_bar
 from stereoreg_ros.cli.parsing import BAD_FILE, OK, Commands, WrongCallError, add_options, given
 from stereoreg_ros.cli.series import add_series_and_frame, slices_of
@@ -63,7 +63,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
         try:
             # Only here: nothing else in the package needs matplotlib.
-            from stereoreg_ros.calibration_plot import draw_series_scale
+            from stereoreg_ros.calibration.plot import draw_series_scale
         except ModuleNotFoundError:
             raise WrongCallError(
                 "--plot draws with matplotlib, which is not installed; it is python3-matplotlib in Ubuntu"

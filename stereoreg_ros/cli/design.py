@@ -22,15 +22,15 @@ from stereoreg_ros.cli.parsing import (
     given,
     make_folder,
 )
-from stereoreg_ros.design.expected_error import Imaging
-from stereoreg_ros.design.inspection_table import table_of
-from stereoreg_ros.design.layouts import Envelope
-from stereoreg_ros.design.proposal import Proposal, propose
-from stereoreg_ros.design.search import Wish
+from stereoreg_ros.files.whole_file import write_whole
+from stereoreg_ros.frames.design_search import Wish
+from stereoreg_ros.frames.expected_error import Imaging
+from stereoreg_ros.frames.inspection_table import table_of
+from stereoreg_ros.frames.layouts import Envelope
+from stereoreg_ros.frames.proposal import Proposal, propose
 from stereoreg_ros.geometry.frame_file import frame_text
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
-from stereoreg_ros.whole_file import write_whole
 
 _AXES: Final = (
     "Axes, right-handed: with nominal_orientation 0 0 0 1 x points to the patient's left, y to the back, z to the head "

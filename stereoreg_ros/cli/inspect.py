@@ -9,8 +9,8 @@ from typing import Final
 
 from stereoreg_ros.cli.output import print_line, progress_bar
 from stereoreg_ros.cli.parsing import OK, Commands, WrongCallError, add_options, given
-from stereoreg_ros.design.inspection import Inspection, inspect_frame
-from stereoreg_ros.design.inspection_table import table_of
+from stereoreg_ros.frames.inspection import Inspection, inspect_frame
+from stereoreg_ros.frames.inspection_table import table_of
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.options import RegistrationOptions
@@ -85,7 +85,7 @@ def draw(inspection: Inspection, path: Path) -> None:
     """Write the picture; WrongCallError where nothing can draw."""
     try:
         # Only here: what needs no picture needs no matplotlib.
-        from stereoreg_ros.design.inspection_plot import draw_inspection
+        from stereoreg_ros.frames.inspection_plot import draw_inspection
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] not in ("matplotlib", "mpl_toolkits"):
             raise

@@ -16,7 +16,7 @@ from pydicom.filewriter import write_file_meta_info
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
 
 from stereoreg_ros.dicom.elements import DicomError, reading
-from stereoreg_ros.whole_file import read_whole
+from stereoreg_ros.files.whole_file import read_whole
 
 # Of a file on the disk. What comes over the network has a bound of its own.
 _MAX_INFLATED_BYTES: Final = 2**30

@@ -15,10 +15,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from stereoreg_ros.bounded_yaml import MOST_BYTES, UnusableYamlError, compose, shown
+from stereoreg_ros.files.bounded_yaml import MOST_BYTES, UnusableYamlError, compose, shown
+from stereoreg_ros.files.whole_file import read_whole
 from stereoreg_ros.geometry.frame import MIN_LINES, Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.whole_file import read_whole
 
 _MAX_LINES = 60
 _MAX_NAME = 100

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
+from stereoreg_ros.geometry.visibility import may_show, must_show
 from stereoreg_ros.matching.clutter import likeness_to_pieces, matched_densities
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.pose_volume import low_stretch, plane_sample, pose_volume, stretch
@@ -24,7 +25,6 @@ from stereoreg_ros.matching.significance import (
     share_of,
 )
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.matching.visibility import may_show, must_show
 from stereoreg_ros.options import RegistrationOptions
 
 # Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.

@@ -9,11 +9,11 @@ import numpy as np
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.matching import three_line
+from stereoreg_ros.matching import by_levels
 from stereoreg_ros.matching.consensus import decades_apart, judged
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
 from stereoreg_ros.matching.prior import Near, Prior
-from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.matching.seeds import Starts
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.options import RegistrationOptions
@@ -49,7 +49,7 @@ def match_near(
         found = [one for one in settle(spots, frame, start, options.min_inliers) if one.missing == 0]
         found = judged(found, spots, frame, near, decades_apart(options))
     if not found:
-        found = three_line.match_most(spots, frame, near, options)
+        found = by_levels.match_most(spots, frame, near, options)
     if len(found) != 1:
         return None
     best = found[0]
@@ -60,7 +60,7 @@ def match_near(
     matched = best.spot_of_line != UNMATCHED
     rows = np.sort(best.spot_of_line[matched])
     own = replace(best, spot_of_line=np.where(matched, np.searchsorted(rows, best.spot_of_line), UNMATCHED))
-    twins = three_line.match(spots.only(rows), frame, prior, options, known=[own])
+    twins = by_levels.match(spots.only(rows), frame, prior, options, known=[own])
     if twins.given_up or len(twins.hypotheses) != 1:
         return None
     (looked_at,) = twins.hypotheses

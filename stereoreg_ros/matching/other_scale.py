@@ -16,11 +16,11 @@ from scipy.stats import chi2
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut
+from stereoreg_ros.geometry.visibility import may_show
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE, MISSING_COST, SHARED_SPOT_MM, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.matching.visibility import may_show
 from stereoreg_ros.solvers.maximum_likelihood import refine
 
 # Standard deviation of a mistaken spacing along each axis, as a share of it, and the largest that is believed.

@@ -23,8 +23,8 @@ from scipy.stats import qmc
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
+from stereoreg_ros.geometry.visibility import END_SLACK_MM, LEAST_COSINE
 from stereoreg_ros.matching.prior import Near, Prior
-from stereoreg_ros.matching.visibility import END_SLACK_MM, LEAST_COSINE
 
 _LOG2_PLANES = 14
 # Of more sets of rods than this, so many are drawn.

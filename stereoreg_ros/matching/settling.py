@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut, cut_jacobian
+from stereoreg_ros.geometry.visibility import may_show
 from stereoreg_ros.matching.consensus import GATE, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
-from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.matching.seeds import Starts
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.matching.visibility import may_show
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
 _ROUNDS = 4

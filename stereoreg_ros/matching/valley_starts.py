@@ -10,7 +10,7 @@ import numpy as np
 
 from stereoreg_ros.geometry.pose import rotation_exp
 from stereoreg_ros.matching.hypothesis import Hypothesis
-from stereoreg_ros.matching.seed_search import Starts
+from stereoreg_ros.matching.seeds import Starts
 from stereoreg_ros.solvers.likelihood_valley import ARM_MM, UNITS
 
 # Directions, and the distances from the pose at which to start: to both sides, as far as it can turn and be met.

@@ -1,0 +1,1 @@
+"""The scanner's pixel scale from the rods."""

@@ -1,0 +1,1 @@
+"""register_node: images in, poses out."""

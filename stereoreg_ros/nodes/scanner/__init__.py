@@ -1,0 +1,1 @@
+"""Where slices come from: the scanner's network, files, or a simulation."""
