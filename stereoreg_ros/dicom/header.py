@@ -34,7 +34,8 @@ class SliceHeader:
 
     path: the file. scale: mm/pixel. scanner_from_slice: plane of the slice in patient axes (LPS), mm; has_plane:
     false where the file gives neither position nor orientation, and the pose is the identity.
-    rescale_slope, rescale_intercept: HU = stored value * slope + intercept.
+    rescale_slope, rescale_intercept: HU = stored value * slope + intercept. frame_of_reference_uid: of the axes, empty
+    where the file has none.
     """
 
     path: Path
@@ -47,6 +48,7 @@ class SliceHeader:
     has_plane: bool
     rescale_slope: float
     rescale_intercept: float
+    frame_of_reference_uid: str = ""
 
     @property
     def table_position_mm(self) -> float:
@@ -80,6 +82,7 @@ def read_header(file: Path, dataset: pydicom.Dataset) -> SliceHeader:
         has_plane=scanner_from_slice is not None,
         rescale_slope=slope,
         rescale_intercept=intercept,
+        frame_of_reference_uid=str(element_value(file, dataset, "FrameOfReferenceUID") or ""),
     )
 
 

@@ -11,8 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from stereoreg_ros.result import Reason, Refusal, Registration, diagnostics
 
 NAME: Final = "registration"
-# How the message begins that refuses an image with another pixel spacing than the one told.
-OTHER_SPACING: Final = "the slice's pixel spacing is"
 
 
 def name_of_status(node_name: str, what: str) -> str:

@@ -1,4 +1,7 @@
-"""Publishes CT slices: `slice_spacing`, `slice_pose` (scanner_from_slice) and then `image` (in HU), with one stamp."""
+"""Publishes CT slices: `image` (in HU), and before it, with the same stamp, what belongs to it.
+
+`slice_spacing`, `slice_pose` (scanner_from_slice) and `slice_frame_of_reference`.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,15 @@ from std_msgs.msg import Header
 
 from stereoreg_ros.dicom import DicomSlice
 from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message, scale_to_message
+from stereoreg_ros.nodes.register.parameters import Entry
 
 POSE_GRACE_S: Final = 5.0
 # Acknowledgements may come as late as the heartbeat of three seconds, until when nothing may be overwritten.
 _QOS: Final = QoSProfile(depth=200, reliability=QoSReliabilityPolicy.RELIABLE)
+# What players had to set before slices brought their own pixel spacing.
+UNUSED_REGISTER_NODE: Final = Entry(
+    "register_node", "", "not used any more, as slices bring their own pixel spacing; kept for launch files that set it"
+)
 _INT16: Final = np.iinfo(np.int16)
 # Stamps may run ahead of a coarse clock; by more, the clock was set back.
 _SET_BACK_NS: Final = 10**9
@@ -38,6 +46,7 @@ class SlicePublisher:
         # The image's publisher last: DDS announces them in order, and who gets an image so knows what comes with it.
         self._spacing_publisher = node.create_publisher(Vector3Stamped, "slice_spacing", _QOS)
         self._pose_publisher = node.create_publisher(PoseStamped, "slice_pose", _QOS)
+        self._reference_publisher = node.create_publisher(Header, "slice_frame_of_reference", _QOS)
         self._image_publisher = node.create_publisher(Image, "image", _QOS)
         self._last_stamp_ns = 0
         self._image_subscribed_s: float | None = None
@@ -73,6 +82,8 @@ class SlicePublisher:
         if dicom_slice.header.has_plane:
             pose = pose_to_message(dicom_slice.ct_slice.scanner_from_slice)
             self._pose_publisher.publish(PoseStamped(header=header, pose=pose))
+        reference = dicom_slice.header.frame_of_reference_uid
+        self._reference_publisher.publish(Header(stamp=stamp, frame_id=reference))
         image = image_from_hu(_smallest_exact(dicom_slice.ct_slice.hu))
         image.header = header
         self._image_publisher.publish(image)
@@ -80,7 +91,12 @@ class SlicePublisher:
     def delivered(self) -> bool:
         """Whether every subscriber has everything."""
         now = Duration(seconds=0)
-        publishers = (self._spacing_publisher, self._pose_publisher, self._image_publisher)
+        publishers = (
+            self._spacing_publisher,
+            self._pose_publisher,
+            self._reference_publisher,
+            self._image_publisher,
+        )
         return all(publisher.wait_for_all_acked(now) for publisher in publishers)
 
 

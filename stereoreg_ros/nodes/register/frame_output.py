@@ -35,10 +35,10 @@ class FrameTopics:
 
 
 class FrameOutput:
-    """A frame, its topics, and its latest pose where its last slice was accepted."""
+    """A frame, the frame_id of its axes, its topics, and its latest pose where its last slice was accepted."""
 
-    def __init__(self, frame: Frame, topics: FrameTopics) -> None:
-        self.frame, self.topics = frame, topics
+    def __init__(self, frame: Frame, topics: FrameTopics, axes: str) -> None:
+        self.frame, self.topics, self.axes = frame, topics, axes
         self.latest: Accepted | None = None
 
     def publish(
@@ -46,10 +46,12 @@ class FrameOutput:
         result: Registration | Refusal,
         header: Header,
         received_s: float,
-        child_frame_id: str,
         send_transform: Callable[[TransformStamped], None] | None,
     ) -> None:
-        """Publish an accepted pose; a refusal only ends the one before, on which no target may rest any more."""
+        """Publish an accepted pose; a refusal only ends the one before, on which no target may rest any more.
+
+        received_s: when the slice's image came, seconds of the steady clock, from which the pose's age counts.
+        """
         if not result:
             self.latest = None
             return
@@ -60,10 +62,10 @@ class FrameOutput:
         with_covariance.pose.covariance = conversions.covariance_to_message(result.covariance)
         self.topics.with_covariance.publish(with_covariance)
         if send_transform is not None:
-            send_transform(transform_of(message, child_frame_id))
+            send_transform(transform_of(message, self.axes))
         self.latest = Accepted(header, result, received_s)
 
-    def publish_target(self, target: TargetInFrame, frame_id: str) -> None:
+    def publish_target(self, target: TargetInFrame) -> None:
         """Publish the target in the frame's axes, with the stamp of the pose it rests on."""
-        header = Header(stamp=target.header.stamp, frame_id=frame_id)
+        header = Header(stamp=target.header.stamp, frame_id=self.axes)
         self.topics.target.publish(PointStamped(header=header, point=conversions.point_to_message(target.point_mm)))

@@ -114,7 +114,8 @@ class NodeSettings:
         (), "files of several frames, in place of frame_file; each gets topics under its name"
     )
     pixel_spacing: tuple[float, float] = setting(
-        (0.0, 0.0), "pixel spacing [sx, sy]: between columns, between rows, mm/pixel; [0, 0]: not told yet"
+        (0.0, 0.0),
+        "pixel spacing [sx, sy] of images without one of their own: between columns and between rows, mm; [0, 0]: none",
     )
     pixel_shear: float = setting(0.0, "shear of the pixel grid, mm/pixel", -10.0, 10.0)
     rescale_slope: float = setting(1.0, "HU = value * rescale_slope + rescale_intercept; not 0", -1e6, 1e6)
@@ -127,6 +128,9 @@ class NodeSettings:
     publish_tf: bool = setting(False, "whether to send each pose to TF too, which needs tf2_ros")
     max_pose_age: float = setting(
         60.0, "oldest pose that target_in_frame may rest on, s since its slice came", 0.1, 1e6
+    )
+    max_target_age: float = setting(
+        1800.0, "oldest target that is still answered, s since it came; the patient may have moved", 1.0, 1e6
     )
     stale_after: float = setting(10.0, "how long no slice may come before the stream counts as stale, s", 0.1, 1e6)
     calibration_timeout: float = setting(5.0, "how long recalibration waits for slices that it can use, s", 0.0, 600.0)
@@ -189,12 +193,12 @@ class NodeSettings:
             f"target error up to {options.max_target_error_mm:g} mm, "
             f"standard deviation of the position up to {options.max_position_std_mm:g} mm, "
             f"{options.min_inliers} rods or more, false alarms up to 10^{options.max_log10_false_alarms:g}, "
-            f"poses up to {self.max_pose_age:g} s old"
+            f"poses up to {self.max_pose_age:g} s old, targets up to {self.max_target_age:g} s"
         )
 
     @property
     def scale(self) -> PixelScale | None:
-        """The pixel scale; None until the spacing was told."""
+        """The pixel scale of images that come without one; None where pixel_spacing is not set."""
         return PixelScale(*self.pixel_spacing, self.pixel_shear) if self.pixel_spacing != (0.0, 0.0) else None
 
 

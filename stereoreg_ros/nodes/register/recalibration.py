@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import Final
 
@@ -71,10 +71,3 @@ class Recalibration:
             )
         except Exception as error:  # handed to whoever polls
             attempt.set_exception(error)
-
-
-class NextTurn:
-    """Awaited by a callback that lets others have their turn first."""
-
-    def __await__(self) -> Generator[None, None, None]:
-        yield

@@ -2,71 +2,58 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
-import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Final
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped, Vector3Stamped
+from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import Image
 from std_msgs.msg import Header
-from visualization_msgs.msg import MarkerArray
 
 from stereoreg_ros.calibration.calibrate import sighting_of
-from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.frame_file import load_frame
-from stereoreg_ros.geometry.pose import Pose
-from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.nodes.common import conversions
-from stereoreg_ros.nodes.common.conversions import MessageError
-from stereoreg_ros.nodes.common.diagnostic_status import OTHER_SPACING, name_of_status, status_of, status_of_unusable
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.nodes.common.diagnostic_status import name_of_status, status_of, status_of_unusable
 from stereoreg_ros.nodes.common.process import run
-from stereoreg_ros.nodes.common.qos import QUEUE, publisher_of, subscription_of
+from stereoreg_ros.nodes.common.qos import QUEUE, publisher_of
 from stereoreg_ros.nodes.common.transforms import broadcaster_of, has_tf2
-from stereoreg_ros.nodes.register.backlog import MOST_WAIT_S, Backlog, received_s, waiting_in
-from stereoreg_ros.nodes.register.companion import Companion
+from stereoreg_ros.nodes.register.backlog import MOST_WAIT_S, Backlog
+from stereoreg_ros.nodes.register.frame_loading import load_frames
 from stereoreg_ros.nodes.register.frame_output import FrameOutput, FrameTopics
-from stereoreg_ros.nodes.register.image_sources import ImageSources
-from stereoreg_ros.nodes.register.markers import markers_of
+from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice
 from stereoreg_ros.nodes.register.parameters import NodeSettings, ParameterError, changed_settings, declare_settings
-from stereoreg_ros.nodes.register.scale_keeper import ScaleKeeper
+from stereoreg_ros.nodes.register.pictures import Pictures
+from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse, ScaleKeeper
+from stereoreg_ros.nodes.register.scale_services import ScaleServices
+from stereoreg_ros.nodes.register.slice_input import SliceInput
+from stereoreg_ros.nodes.register.slice_registration import Registered, SliceSetup, Unusable, register_incoming
 from stereoreg_ros.nodes.register.stream_status import StreamStatus
-from stereoreg_ros.nodes.register.targets import TargetInFrame, status_of_target, target_in_frame
-from stereoreg_ros.registration import preparation, register_frames
-from stereoreg_ros.result import Reason, Refusal, Registration
+from stereoreg_ros.nodes.register.target_keeper import TargetKeeper
+from stereoreg_ros.nodes.register.worker import Worker
+from stereoreg_ros.registration import preparation
 
-_LOOK_FOR_OVERDUE_S = 0.1
-_REPORT_STREAM_S = 1.0
-_REPEAT_WARNING_S = 5.0
-# Longer, and whoever sets a parameter would wait too long for the answer.
-_PREPARE_S = 2.0
-_SPARE_TIME_S = 0.2
-_NOTHING = object()
-_TOPIC_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-
-
-@dataclass(frozen=True, eq=False)
-class _Unregistered:
-    """An image and the pixel spacing that it came with; None where it came with none."""
-
-    image: Image
-    spacing: PixelScale | None
+_REPORT_STREAM_S: Final = 1.0
+_REPEAT_WARNING_S: Final = 5.0
+# Before the node says that it is ready; the rest is prepared while no slice waits.
+_PREPARE_AT_START_S: Final = 2.0
+_PREPARE_AT_ONCE_S: Final = 0.05
+# Tables for one spacing serve those near it, so that they are worth preparing before one is known.
+_TYPICAL_SCALE: Final = PixelScale(0.5, 0.5)
 
 
 class RegisterNode(Node):
-    """Image in, pose or refusal out; topics, services and diagnostics are described in the README."""
+    """Slices in, poses or refusals out; topics, services and diagnostics are described in the README.
+
+    The callbacks receive and publish; what takes time is done by one worker, slice after slice.
+    """
 
     def __init__(self) -> None:
         super().__init__("register_node")
@@ -77,283 +64,231 @@ class RegisterNode(Node):
         # They are there before a frame is, so that a controller can wait for them.
         self._topics = [FrameTopics(self)]
         self._outputs: list[FrameOutput] = []
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._preparation: Iterator[None] = iter(())
-        self._spare_time = self.create_timer(_SPARE_TIME_S, self._prepare_in_spare_time, clock=steady)
+        self._preparation: Iterator[None] | None = None
+        self._prepared_for: PixelScale | None = None
         self._frame_fault = self._load_start_frames()
+        if self._preparation is not None:
+            _prepare(self._preparation, _PREPARE_AT_START_S)
         self._backlog = Backlog()
-        self._target: PointStamped | None = None
+        self._worker = Worker(self)
+        # Counts changes of what slices are registered with.
+        self._revision = 0
+        # The axes of the last slice, by frame_id and frame of reference, and the spacing that it stated.
+        self._axes: tuple[str, str | None] | None = None
+        self._spacing_stated = False
         self._stream = StreamStatus(time.monotonic())
         self._send_transform: Callable[[TransformStamped], None] | None = None
         self._choose_tf()
 
         self._diagnostics = publisher_of(self, DiagnosticArray, "/diagnostics", QUEUE)
-        self._overlay = publisher_of(self, Image, "overlay", QUEUE)
-        self._markers = publisher_of(self, MarkerArray, "markers", QUEUE)
-        # The image last: where all are there, rclpy serves them in this order and no image has to wait.
-        self._slice_spacing: Companion[PixelScale, Image] = Companion(
-            self,
-            Vector3Stamped,
-            "slice_spacing",
-            conversions.scale_from_message,
-            same=PixelScale.__eq__,
-            required=lambda: False,
-            met=self._pair_with_pose,
-        )
-        self._slice_pose: Companion[Pose, _Unregistered] = Companion(
-            self,
-            PoseStamped,
-            "slice_pose",
-            conversions.pose_from_message,
-            same=_same_pose,
-            required=lambda: self.settings.slice_pose_required,
-            met=self._register,
-        )
-        self._image_input = subscription_of(self, Image, "image", self._on_image, QUEUE)
-        inputs = self._image_input, self._slice_pose.subscription, self._slice_spacing.subscription
-        self._sources = ImageSources(self, inputs)
-        subscription_of(self, PointStamped, "target", self._on_target, QUEUE)
-        self._more_wait = self.create_guard_condition(self._register_next)
-        self.create_timer(_LOOK_FOR_OVERDUE_S, self._refuse_overdue, clock=steady)
-        self.create_timer(_REPORT_STREAM_S, self._report_stream, clock=steady)
+        self._pictures = Pictures(self)
+        self._input = SliceInput(self, lambda: self.settings.slice_pose_required, self._on_slice)
+        self._target = TargetKeeper(self, lambda: (self.settings, self._outputs), self._diagnose_now)
+        self.create_timer(_REPORT_STREAM_S, self._report_stream, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._scale = ScaleKeeper(self, self)
+        self._scale_services = ScaleServices(
+            self, self._scale, lambda: (self.settings, self._frame_to_measure_with(), self._input.has_source)
+        )
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._scale.load()
         self.get_logger().info(f"ready, {self.settings.in_force}")
 
-    @property
-    def frame(self) -> Frame | None:
-        """The first frame, which the pixel scale is measured with; None where no frame could be loaded."""
-        return self._outputs[0].frame if self._outputs else None
+    def destroy_node(self) -> None:
+        """End; a recalibration that goes on is refused."""
+        self._scale_services.close()
+        super().destroy_node()
 
-    def images_come(self) -> bool:
-        """Whether somebody publishes images."""
-        return self.count_publishers(self._image_input.topic_name) > 0
+    # From a slice to a pose, in the order of the data.
 
-    # From an image to a pose, in the order of the data.
+    def _on_slice(self, incoming: IncomingSlice) -> None:
+        self._backlog.add(incoming, time.monotonic())
+        self._go_on()
 
-    def _on_image(self, image: Image, info: Any) -> None:
-        self._backlog.add(image, received_s(info))
-        self._register_next()
-
-    def _register_next(self) -> None:
-        """One slice, and then it is the turn of services, parameters and timers before the next."""
-        for image, came_s in waiting_in(self._image_input):
-            self._backlog.add(image, came_s)
-        for late in self._backlog.take_late(time.time()):
+    def _go_on(self) -> None:
+        """Begin with the slice whose turn it is, and prepare tables while none waits."""
+        for late in self._backlog.take_late(time.monotonic()):
             self._skip(late)
-        image = self._backlog.take()
-        try:
-            if image is not None:
-                self._slice_spacing.meet(image.header.stamp, image)
-        finally:
-            # Whatever one slice does, the next has its turn.
-            if len(self._backlog):
-                self._more_wait.trigger()
+        while self._worker.is_free and (incoming := self._backlog.take()) is not None:
+            self._begin(incoming)
+        if self._worker.is_free and self._preparation is not None:
+            tables = self._preparation
+            self._worker.submit(partial(_prepare, tables, _PREPARE_AT_ONCE_S), partial(self._on_prepared, tables))
 
-    def _pair_with_pose(self, image: Image, spacing: PixelScale | MessageError | None) -> None:
-        if isinstance(spacing, MessageError):
-            self._slice_pose.give_up(image.header.stamp)
-            self._register(_Unregistered(image, None), spacing)
-        else:
-            self._slice_pose.meet(image.header.stamp, _Unregistered(image, spacing))
+    def _begin(self, incoming: IncomingSlice) -> None:
+        """Refuse a slice that cannot be registered, or have the worker register it."""
+        self._spacing_stated = self._spacing_stated or incoming.spacing is not None
+        scale = self._scale.scale_for(incoming.spacing)
+        fault = self._fault_of(incoming, scale)
+        if fault is not None or scale is None:
+            self._refuse(incoming, fault or Unusable("bad_image", _NO_SPACING))
+            return
+        self._enter(self._axes_of(incoming), incoming.frame_of_reference)
+        if scale.scale != self._prepared_for:
+            self._prepare_tables(scale.scale)
+        latest = [output.latest for output in self._outputs]
+        setup = SliceSetup(
+            self.settings,
+            tuple(output.frame for output in self._outputs),
+            tuple(one.registration.scanner_from_frame if one else None for one in latest),
+            scale,
+        )
+        then = partial(self._on_outcome, incoming, setup, self._revision)
+        self._worker.submit(partial(register_incoming, incoming, setup), then)
 
-    def _refuse_overdue(self) -> None:
-        self._slice_spacing.refuse_overdue()
-        self._slice_pose.refuse_overdue()
-
-    def _register(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError | None) -> None:
-        """Register one image and publish what came of it; whatever is in the image, the node lives on."""
-        started, came_s = time.perf_counter(), time.monotonic()
-        image = unregistered.image
-        header = Header(stamp=image.header.stamp, frame_id=self.settings.scanner_frame_id or image.header.frame_id)
+    def _fault_of(self, incoming: IncomingSlice, scale: ScaleInUse | None) -> Unusable | None:
+        """Why the slice is refused before anybody looks into its image."""
         if not self._outputs:
-            self._refuse_unusable("bad_frame", self._frame_fault, header, started)
-            return
-        try:
-            ct_slice = self._slice_from(unregistered, scanner_from_slice)
-            results = register_frames(
-                ct_slice,
-                [output.frame for output in self._outputs],
-                self.settings.options,
-                [output.latest.registration.scanner_from_frame if output.latest else None for output in self._outputs],
-                self._scale.covariance,
+            return Unusable("bad_frame", self._frame_fault)
+        named, plane = self.settings.scanner_frame_id, incoming.plane
+        if incoming.fault:
+            return Unusable("bad_image", incoming.fault)
+        if fault := self._input.fault(time.monotonic()):
+            return Unusable("bad_image", fault)
+        if plane is not None and named and plane.frame_id not in ("", named):
+            return Unusable(
+                "bad_image",
+                f"slice_pose has the frame_id '{plane.frame_id}', expected the parameter scanner_frame_id, '{named}': "
+                "set that to the axes of slice_pose, or leave it empty",
             )
-            duration_s = time.perf_counter() - started
-            statuses = [status_of(result, self._scale.source, duration_s, header.frame_id) for result in results]
-        except ValueError as error:
-            self._refuse_unusable("bad_image", str(error), header, started)
+        return Unusable("bad_image", _NO_SPACING) if scale is None else None
+
+    def _axes_of(self, incoming: IncomingSlice) -> str:
+        """The frame_id of the axes in which the slice's poses are."""
+        return self.settings.scanner_frame_id or incoming.axes
+
+    def _enter(self, frame_id: str, frame_of_reference: str | None) -> None:
+        """Note the axes of a slice; in other axes than the last slice's no earlier pose or target means anything."""
+        before, self._axes = self._axes, (frame_id, frame_of_reference)
+        if before is None or before == self._axes:
             return
-        except Exception as error:
-            self.get_logger().error(f"internal error while registering an image\n{traceback.format_exc()}")
-            message = f"internal error: {type(error).__name__}: {error}; please report it with the node's log"
-            self._refuse_unusable("internal_error", message, header, started)
-            return
-        if len(results[0].spots_px) >= self.settings.options.min_inliers:
-            plane, stated = ct_slice.scanner_from_slice, unregistered.spacing
-            self._scale.sightings.append(sighting_of(results[0], ct_slice.hu.size, plane, stated))
-        for output, result in zip(self._outputs, results, strict=True):
-            output.publish(result, header, came_s, self._axes_of(output.frame), self._send_transform)
-        self._publish_statuses(statuses, header)
-        self._count(header)
-        self._publish_target_in_frame()
-        self._publish_pictures(ct_slice, results, header)
-
-    def _skip(self, image: Image) -> None:
-        """Answer an image that is not registered, since newer ones wait; the latest pose stays as it is."""
-        self._slice_spacing.give_up(image.header.stamp)
-        self._slice_pose.give_up(image.header.stamp)
-        message = f"skipped for a newer slice: it had waited for over {MOST_WAIT_S:g} s"
-        statuses = self._unusable("skipped", message, image.header.frame_id, 0.0)
-        self._publish_statuses(statuses, image.header)
-
-    def _slice_from(self, unregistered: _Unregistered, scanner_from_slice: Pose | MessageError | None) -> Slice:
-        image, spacing = unregistered.image, unregistered.spacing
-        if isinstance(scanner_from_slice, MessageError):
-            raise scanner_from_slice
-        if fault := self._sources.fault(time.monotonic()):
-            raise MessageError(fault)
-        settings = self.settings
-        if settings.scale is None:
-            raise MessageError("pixel_spacing is not told yet, set the parameter to [sx, sy] in mm/pixel")
-        if spacing is not None and not self._scale.stands_for(spacing):
-            raise MessageError(f"{OTHER_SPACING} {spacing}, expected that which was told, {self._scale.configured}")
-        hu = conversions.hu_from_image(image, settings.rescale_slope, settings.rescale_intercept)
-        return Slice(hu, settings.scale, Pose.identity() if scanner_from_slice is None else scanner_from_slice)
-
-    def _axes_of(self, frame: Frame) -> str:
-        """Name of a frame's axes in messages: the parameter's where it is alone, else its own."""
-        return self.settings.fiducial_frame_id if len(self._outputs) == 1 else frame.name
-
-    def _refuse_unusable(self, reason: Reason, message: str, header: Header, started: float) -> None:
-        self.get_logger().warning(f"image refused: {message}", throttle_duration_sec=_REPEAT_WARNING_S)
+        names = [
+            f"'{name}'" + (f" (frame of reference {uid or 'unknown'})" if uid is not None else "")
+            for name, uid in (before, self._axes)
+        ]
+        why = f"the slices are in other axes now, {names[1]}, before in {names[0]}"
+        self.get_logger().warning(f"{why}: the poses so far are forgotten")
         self._forget_poses()
-        statuses = self._unusable(reason, message, header.frame_id, time.perf_counter() - started)
-        self._publish_statuses(statuses, header)
-        self._count(header)
+        self._target.drop(why, unless_in=frame_id if frame_id != before[0] else "")
 
-    def _unusable(self, reason: Reason, message: str, hardware_id: str, duration_s: float) -> list[DiagnosticStatus]:
-        """Statuses, one for each frame, of an image that does not come to registration."""
+    def _on_outcome(
+        self, incoming: IncomingSlice, setup: SliceSetup, revision: int, outcome: Registered | Unusable
+    ) -> None:
+        try:
+            if revision != self._revision:
+                # With what was set meanwhile it may be another pose, or none.
+                self._begin(incoming)
+            elif isinstance(outcome, Unusable):
+                self._refuse(incoming, outcome)
+            else:
+                self._publish(incoming, setup.scale, outcome)
+        finally:
+            # Whatever becomes of one slice, the next has its turn.
+            self._go_on()
+
+    def _publish(self, incoming: IncomingSlice, scale: ScaleInUse, registered: Registered) -> None:
+        header = Header(stamp=incoming.stamp, frame_id=self._axes_of(incoming))
+        ct_slice, results = registered.ct_slice, registered.results
+        if len(results[0].spots_px) >= self.settings.options.min_inliers:
+            plane, stated = ct_slice.scanner_from_slice, incoming.spacing
+            self._scale.add(sighting_of(results[0], ct_slice.hu.size, plane, stated), stated)
+        for output, result in zip(self._outputs, results, strict=True):
+            output.publish(result, header, incoming.received_s, self._send_transform)
+        statuses = [status_of(result, scale.source, registered.duration_s, header.frame_id) for result in results]
+        self._publish_statuses(statuses, header.stamp)
+        self._count(header.stamp)
+        self._target.answer()
+        named = [(result, output.axes) for result, output in zip(results, self._outputs, strict=True)]
+        self._pictures.publish(ct_slice, named, header, self._target.of_axes(header.frame_id))
+
+    def _refuse(self, incoming: IncomingSlice, unusable: Unusable) -> None:
+        if unusable.traceback:
+            self.get_logger().error(f"internal error while registering an image\n{unusable.traceback}")
+        self.get_logger().warning(f"image refused: {unusable.message}", throttle_duration_sec=_REPEAT_WARNING_S)
+        self._forget_poses()
+        self._publish_statuses(self._statuses_of(incoming, unusable), incoming.stamp)
+        self._count(incoming.stamp)
+
+    def _skip(self, incoming: IncomingSlice) -> None:
+        """Answer a slice that is not registered, since newer ones wait; the latest pose stays as it is."""
+        message = f"skipped for a newer slice: it had waited for over {MOST_WAIT_S:g} s"
+        self._publish_statuses(self._statuses_of(incoming, Unusable("skipped", message)), incoming.stamp)
+
+    def _statuses_of(self, incoming: IncomingSlice, unusable: Unusable) -> list[DiagnosticStatus]:
+        """Statuses, one for each frame, of a slice that did not come to registration."""
         frames = [(output.frame.name, len(output.frame)) for output in self._outputs]
+        scale = self._scale.scale_for(incoming.spacing)
         return [
             status_of_unusable(
-                reason,
-                message,
+                unusable.reason,
+                unusable.message,
                 frame_name=name,
                 lines=lines,
-                pixel_spacing=self.settings.pixel_spacing,
-                calibration=self._scale.source,
-                duration_s=duration_s,
-                hardware_id=hardware_id,
+                pixel_spacing=(scale.scale.sx, scale.scale.sy) if scale else (0.0, 0.0),
+                calibration=scale.source if scale else "configured",
+                duration_s=unusable.duration_s,
+                hardware_id=self._axes_of(incoming),
             )
             for name, lines in frames or [(source, 0) for source in self.settings.frame_sources]
         ]
 
-    def _publish_statuses(self, statuses: list[DiagnosticStatus], header: Header) -> None:
+    def _publish_statuses(self, statuses: list[DiagnosticStatus], stamp: Time) -> None:
         if len(statuses) > 1:
             for status in statuses:
                 frame = next(pair.value for pair in status.values if pair.key == "frame")
                 status.name = f"{status.name} of {frame}"
         # The image's stamp, so that a status can be laid beside its pose.
-        self._diagnose(statuses, header.stamp)
+        self._diagnose(statuses, stamp)
 
     def _diagnose(self, statuses: list[DiagnosticStatus], stamp: Time) -> None:
         for status in statuses:
             status.name = name_of_status(self.get_fully_qualified_name(), status.name)
         self._diagnostics.publish(DiagnosticArray(header=Header(stamp=stamp), status=statuses))
 
-    def _count(self, header: Header) -> None:
+    def _diagnose_now(self, statuses: list[DiagnosticStatus]) -> None:
+        self._diagnose(statuses, self.get_clock().now().to_msg())
+
+    # The stream as a whole.
+
+    def _count(self, stamp: Time) -> None:
         """Count a slice that was answered, with its latency."""
         # Not as a Time of rclpy, which knows none before 1970.
-        stamp_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
+        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
         latency_ms = (self.get_clock().now().nanoseconds - stamp_ns) / 1e6 if stamp_ns else float("nan")
         self._stream.registered(time.monotonic(), latency_ms)
 
-    def _publish_pictures(self, ct_slice: Slice, results: list[Registration | Refusal], header: Header) -> None:
-        overlay_wanted = self._overlay.get_subscription_count() > 0
-        markers_wanted = self._markers.get_subscription_count() > 0
-        overlay = markers = None
-        try:
-            if overlay_wanted:
-                overlay = conversions.image_from_bgr(draw_overlay(ct_slice, results[0]))
-                overlay.header = header
-            if markers_wanted:
-                named = [(result, self._axes_of(result.frame)) for result in results]
-                markers = markers_of(ct_slice, named, header, self._usable_target(header))
-        except Exception:
-            self.get_logger().error(f"internal error while drawing a slice\n{traceback.format_exc()}")
-        if overlay is not None:
-            self._overlay.publish(overlay)
-        if markers is not None:
-            self._markers.publish(markers)
-
     def _report_stream(self) -> None:
         now_s = time.monotonic()
-        if fault := self._sources.fault(now_s):
+        if fault := self._input.fault(now_s):
             self.get_logger().warning(fault, throttle_duration_sec=_REPEAT_WARNING_S)
         status = self._stream.report(
             now_s,
             self.settings.stale_after,
-            self._backlog.received,
+            self._input.received,
             self._backlog.skipped,
-            len(self._backlog),
+            self._input.waiting + len(self._backlog) + (not self._worker.is_free),
             self.settings.scanner_frame_id,
             self._missing(),
         )
-        self._diagnose([status], self.get_clock().now().to_msg())
+        self._diagnose_now([status])
 
     def _missing(self) -> str:
         """What has to be set before a slice can be registered; empty where nothing has."""
         if not self._outputs:
             return f"no frame: {self._frame_fault}"
-        return "no pixel spacing: set the parameter pixel_spacing" if self.settings.scale is None else ""
+        if self._scale.configured is None and not self._spacing_stated:
+            return "no pixel spacing: set the parameter pixel_spacing, or send slices with slice_spacing"
+        return ""
 
-    # The target.
+    # Frames and their tables.
 
-    def _on_target(self, message: PointStamped) -> None:
-        # A target that cannot be used takes the place of the one before: steering to that one would look right.
-        self._target = message
-        self._publish_target_in_frame()
-
-    def _publish_target_in_frame(self) -> None:
-        if self._target is None:
-            return
-        statuses = []
-        for output in self._outputs:
-            settings = self.settings
-            outcome = target_in_frame(
-                self._target,
-                output.latest,
-                time.monotonic(),
-                settings.max_pose_age,
-                settings.options.max_target_error_mm,
-            )
-            if isinstance(outcome, TargetInFrame):
-                output.publish_target(outcome, self._axes_of(output.frame))
-            else:
-                self.get_logger().warning(outcome.message, throttle_duration_sec=_REPEAT_WARNING_S)
-                if outcome.reason == "bad_target":
-                    self._target = None
-            statuses.append(status_of_target(outcome, output.frame.name, self._target_axes()))
-            if self._target is None:
-                break
-        self._diagnose(statuses, self.get_clock().now().to_msg())
-
-    def _target_axes(self) -> str:
-        return self._target.header.frame_id if self._target is not None else ""
-
-    def _usable_target(self, header: Header) -> PointStamped | None:
-        """The target, where it is in the axes of what is drawn."""
-        target = self._target
-        return target if target is not None and target.header.frame_id == header.frame_id else None
-
-    # Parameters.
+    def _frame_to_measure_with(self) -> Frame | None:
+        return self._outputs[0].frame if self._outputs else None
 
     def _load_start_frames(self) -> str:
         """Load the frames; returns why they cannot be, or nothing."""
         try:
-            self._checked_frames = _loaded(self.settings.frame_sources)
+            self._checked_frames = load_frames(self.settings.frame_sources)
         except ValueError as error:
             self.get_logger().error(f"no slice can be registered until frame_file is set: {error}")
             return str(error)
@@ -363,27 +298,29 @@ class RegisterNode(Node):
     def _use_frames(self) -> None:
         for topics in self._topics:
             topics.destroy()
-        alone = len(self._checked_frames) == 1
-        self._topics = [FrameTopics(self, "" if alone else f"{frame.name}/") for frame in self._checked_frames]
-        self._outputs = [FrameOutput(*both) for both in zip(self._checked_frames, self._topics, strict=True)]
-        self._prepare()
+        frames, alone = self._checked_frames, len(self._checked_frames) == 1
+        self._topics = [FrameTopics(self, "" if alone else f"{frame.name}/") for frame in frames]
+        self._outputs = [FrameOutput(frame, topics, "") for frame, topics in zip(frames, self._topics, strict=True)]
+        self._name_axes()
+        self._prepare_tables(self._prepared_for or self.settings.scale or _TYPICAL_SCALE)
 
-    def _prepare(self) -> None:
-        """Fill the tables that the first slices would wait for; until the scale is told nobody knows which."""
-        if self.settings.scale is None:
-            return
-        scale, options = self.settings.scale, self.settings.options
-        self._preparation = chain.from_iterable(preparation(output.frame, scale, options) for output in self._outputs)
-        end_s = time.monotonic() + _PREPARE_S
-        for _ in self._preparation:
-            if time.monotonic() >= end_s:
-                self._spare_time.reset()
-                break
+    def _name_axes(self) -> None:
+        """The parameter's name where a frame is alone, else the frame's own."""
+        for output in self._outputs:
+            output.axes = self.settings.fiducial_frame_id if len(self._outputs) == 1 else output.frame.name
 
-    def _prepare_in_spare_time(self) -> None:
-        """Go on with what there was no time for, a few tables each time that no slice waits."""
-        if not len(self._backlog) and next(self._preparation, _NOTHING) is _NOTHING:
-            self._spare_time.cancel()
+    def _prepare_tables(self, scale: PixelScale) -> None:
+        """Begin anew with the tables that slices of this scale would wait for."""
+        self._prepared_for, options = scale, self.settings.options
+        frames = [output.frame for output in self._outputs]
+        self._preparation = chain.from_iterable(preparation(frame, scale, options) for frame in frames)
+
+    def _on_prepared(self, tables: Iterator[None], done: bool) -> None:
+        if done and tables is self._preparation:
+            self._preparation = None
+        self._go_on()
+
+    # Parameters.
 
     def _choose_tf(self) -> None:
         if self.settings.publish_tf and self._send_transform is None:
@@ -399,7 +336,7 @@ class RegisterNode(Node):
             if settings.publish_tf and not has_tf2():
                 raise ValueError(_NO_TF2)
             if any(parameter.name in ("frame_file", "frame_files") for parameter in parameters):
-                self._checked_frames = _loaded(settings.frame_sources)
+                self._checked_frames = load_frames(settings.frame_sources)
         except Exception as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
@@ -407,6 +344,7 @@ class RegisterNode(Node):
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         names = {parameter.name for parameter in parameters}
         scale_before, self.settings = self.settings.scale, changed_settings(self, [])
+        self._revision += 1
         if "calibration_slices" in names:
             self._scale.keep_slices(self.settings.calibration.calibration_slices)
         if "publish_tf" in names:
@@ -415,14 +353,23 @@ class RegisterNode(Node):
             self._frame_fault = ""
             self._use_frames()
             self._forget_slices()
+        if "fiducial_frame_id" in names:
+            self._name_axes()
         if names & {"pixel_spacing", "pixel_shear"}:
-            if self._scale.scale_was_set(scale_before):
-                self._forget_slices()
-            elif self.settings.scale != scale_before:
-                # It was measured from slices that are there, which say the same as before; a pose of theirs does not.
-                self._forget_poses()
+            self._apply_scale(scale_before)
         if names & _OF_THE_TABLES:
-            self._prepare()
+            self._prepare_tables(self.settings.scale or self._prepared_for or _TYPICAL_SCALE)
+        if self._worker.is_free:
+            self._go_on()
+
+    def _apply_scale(self, before: PixelScale | None) -> None:
+        if self._scale.sets_it_itself:
+            # It was measured from slices that are there, which say the same as before; a pose of theirs does not.
+            self._forget_poses()
+            return
+        self._scale.configure()
+        if self.settings.scale != before:
+            self._forget_slices()
 
     def _forget_slices(self) -> None:
         """A slice seen under another frame or scale says nothing about this one."""
@@ -436,7 +383,7 @@ class RegisterNode(Node):
 
 
 # What the matcher's tables depend on.
-_OF_THE_TABLES = {
+_OF_THE_TABLES: Final = {
     "pixel_spacing",
     "spot_noise_px",
     "frame_tolerance_mm",
@@ -446,30 +393,22 @@ _OF_THE_TABLES = {
     "max_rotation_deg",
     "min_inliers",
 }
-_NO_TF2 = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
+_NO_TF2: Final = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
+_NO_SPACING: Final = (
+    "nobody has said what a pixel is: the slice came without slice_spacing, and pixel_spacing is not set, expected "
+    "[sx, sy] in mm/pixel"
+)
 
 
-def _same_pose(one: Pose, other: Pose) -> bool:
-    return np.array_equal(one.rotation, other.rotation) and np.array_equal(one.translation, other.translation)
-
-
-def _loaded(sources: tuple[str, ...]) -> tuple[Frame, ...]:
-    """The frames; ValueError where one cannot be loaded, or several cannot have topics of their own."""
-    frames = tuple(load_frame(source) for source in sources)
-    names = [frame.name for frame in frames]
-    for name in names:
-        if len(names) > 1 and not _TOPIC_NAME.fullmatch(name):
-            raise ValueError(
-                f"frame_files: frame '{name}' cannot name a topic, expected a letter and then letters, digits and '_'"
-            )
-        if names.count(name) > 1:
-            raise ValueError(f"frame_files: two frames are called '{name}', expected distinct names")
-    return frames
+def _prepare(tables: Iterator[None], seconds: float) -> bool:
+    """Fill tables for so long; returns whether all are filled."""
+    end_s = time.monotonic() + seconds
+    return all(time.monotonic() < end_s for _ in tables)
 
 
 def main() -> int:
     """Entry point of `register_node`."""
-    return run(RegisterNode)
+    return run(RegisterNode, threads=2)
 
 
 if __name__ == "__main__":

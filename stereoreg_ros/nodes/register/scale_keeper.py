@@ -1,20 +1,17 @@
-"""The pixel scale while the node runs: told, measured, kept in a file, gone back on."""
+"""The pixel scale while the node runs: stated by slices, configured, measured, kept in a file, gone back on."""
 
 from __future__ import annotations
 
-import time
-import traceback
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
 
-from stereoreg_ros.calibration.calibrate import Sighting
+from stereoreg_ros.calibration.calibrate import Calibration, Sighting
 from stereoreg_ros.calibration.file import (
     CalibrationFileError,
     CalibrationRecord,
@@ -26,67 +23,85 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.register.parameters import NodeSettings
-from stereoreg_ros.nodes.register.recalibration import NextTurn, Recalibration
 
-_POLL_S = 0.002
-_SAME_SPACING = 1e-4
+
+@dataclass(frozen=True, eq=False)
+class ScaleInUse:
+    """The pixel scale that a slice is registered with, and where it comes from.
+
+    covariance: of a measured scale, see `register_spots`; None of a configured one, known to `scale_tolerance`.
+    """
+
+    scale: PixelScale
+    source: Literal["configured", "measured"] = "configured"
+    covariance: Array | None = None
 
 
 class _Registering(Protocol):
-    """What the keeper asks of the node: its settings, the frame to measure with, and whether somebody sends slices."""
+    """What the keeper asks of the node."""
 
     @property
     def settings(self) -> NodeSettings: ...
-    @property
-    def frame(self) -> Frame | None: ...
-    def images_come(self) -> bool: ...
 
 
 class ScaleKeeper:
-    """The services `~/recalibrate` and `~/reset_calibration`, and where the scale in use comes from.
+    """Which scale a slice is registered with: its own, or the one configured where it brings none; or what was measured
+    in place of that one.
 
-    source: `configured` or `measured`; covariance: of a measured scale, None of one that is known to `scale_tolerance`.
+    sightings: the last slices that the scale can be measured from, all of one scale.
     """
 
     def __init__(self, node: Node, registering: _Registering) -> None:
-        self.source: Literal["configured", "measured"] = "configured"
-        self.covariance: Array | None = None
         self.sightings: deque[Sighting] = deque(maxlen=registering.settings.calibration.calibration_slices)
         self._node, self._registering = node, registering
         self._configured = registering.settings.scale
-        self._recalibration: Recalibration | None = None
+        self._record: CalibrationRecord | None = None
+        # Of the sightings.
+        self._stated: PixelScale | None = None
         self._sets_it_itself = False
-        # A call goes on over many turns of the executor, and must keep neither slices nor other calls from theirs.
-        node.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=ReentrantCallbackGroup())
-        node.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
 
     @property
     def configured(self) -> PixelScale | None:
-        """What was told or configured last; None where nothing was. In its place a measured scale may be in use."""
+        """The parameters' scale, before a measured one took its place there; None where none was set."""
         return self._configured
 
-    def stands_for(self, spacing: PixelScale) -> bool:
-        """Whether the scale in use is the right one for a slice that came with this spacing."""
-        if self._configured is None:
-            return False
-        ours, slices = ((one.sx, one.sy, one.shear) for one in (self._configured, spacing))
-        return np.allclose(ours, slices, rtol=_SAME_SPACING, atol=_SAME_SPACING * spacing.sx)
+    @property
+    def sets_it_itself(self) -> bool:
+        """Whether it is the keeper that is setting the parameters just now."""
+        return self._sets_it_itself
 
-    def scale_was_set(self, before: PixelScale | None) -> bool:
-        """The scale's parameters were set; returns whether somebody else did, and the scale in use is another now."""
-        if self._sets_it_itself:
-            return False
-        self._configured, self.source, self.covariance = self._registering.settings.scale, "configured", None
-        # Whoever sends slices tells their spacing, and tells it again after every restart.
-        self.load()
-        return self._registering.settings.scale != before
+    def scale_for(self, stated: PixelScale | None) -> ScaleInUse | None:
+        """The scale for a slice that states this one, or None; None where nobody has said what a pixel is."""
+        nominal = stated or self._configured
+        if nominal is None:
+            return None
+        if self._record is not None and self._record.replaces(nominal):
+            return ScaleInUse(self._record.scale, "measured", np.array(self._record.covariance))
+        return ScaleInUse(nominal)
+
+    @property
+    def to_measure(self) -> ScaleInUse | None:
+        """The scale of the sightings, or of the slices to come, which a measured one would replace."""
+        return self.scale_for(self._stated)
+
+    def add(self, sighting: Sighting, stated: PixelScale | None) -> None:
+        """Take a slice to measure from; slices of another scale say nothing about this one's."""
+        if stated != self._stated:
+            self.sightings.clear()
+            self._stated = stated
+        self.sightings.append(sighting)
 
     def keep_slices(self, count: int) -> None:
         """Keep the last `count` slices to measure from."""
         self.sightings = deque(self.sightings, maxlen=count)
 
+    def configure(self) -> None:
+        """Somebody has set the scale's parameters: what was measured counts on only where the file has it."""
+        self._configured, self._record = self._registering.settings.scale, None
+        self.load()
+
     def load(self) -> None:
-        """Take up what was measured in place of the configured scale, where that can be trusted."""
+        """Take up what was measured before, where that can be believed, for the slices that it was measured for."""
         settings, log = self._registering.settings, self._node.get_logger()
         if not settings.calibration_file:
             return
@@ -94,82 +109,53 @@ class ScaleKeeper:
         try:
             record = load_calibration(path)
         except CalibrationFileError as error:
-            log.warning(f"calibration_file is not used, the configured pixel_spacing is: {error}")
+            log.warning(f"calibration_file is not used, the nominal pixel spacing is: {error}")
             return
         if record is None:
             return
-        configured = settings.scale
-        if configured is None or not record.replaces(configured):
-            now = "not told" if configured is None else f"[{configured.sx:.6g}, {configured.sy:.6g}]"
-            log.warning(
-                f"calibration_file is not used: {path} was measured in place of the pixel_spacing "
-                f"[{record.configured.sx:.6g}, {record.configured.sy:.6g}], which is {now}"
-            )
-            return
-        fault = self._set(record.scale, "measured", np.array(record.covariance))
-        if fault:
-            log.warning(f"calibration_file is not used: {path}: {fault}")
-            return
-        log.info(
-            f"pixel_spacing [{record.scale.sx:.6g}, {record.scale.sy:.6g}] as measured on {record.date}, from {path}"
+        self._record = record
+        old, new, now = record.configured, record.scale, self._configured
+        measured = (
+            f"pixel spacing [{new.sx:.6g}, {new.sy:.6g}] in place of [{old.sx:.6g}, {old.sy:.6g}], as measured on "
+            f"{record.date}, from {path}"
         )
+        if now is None:
+            log.info(measured)
+        elif not record.replaces(now):
+            log.warning(
+                f"calibration_file is not used for images without a spacing of their own: {path} was measured in place "
+                f"of the pixel_spacing [{old.sx:.6g}, {old.sy:.6g}], which is [{now.sx:.6g}, {now.sy:.6g}]"
+            )
+        elif fault := self._set(new):
+            self._record = None
+            log.warning(f"calibration_file is not used: {path}: {fault}")
+        else:
+            log.info(measured)
 
-    async def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._recalibration is not None:
-            response.success, response.message = False, "a recalibration is running already, wait for its answer"
-            return response
-        settings, frame = self._registering.settings, self._registering.frame
-        images_come = self._registering.images_come()
-        if frame is None or settings.scale is None or not (self.sightings or images_come):
-            response.success, response.message = False, "no slice has been accepted yet, nothing to calibrate from"
-            return response
-        deadline_s = time.monotonic() + (settings.calibration_timeout if images_come else 0.0)
-        self._recalibration = Recalibration(frame, settings.scale, settings.options, settings.calibration, deadline_s)
-        try:
-            response.success, response.message = await self._recalibrate(self._recalibration)
-        except Exception as error:
-            self._node.get_logger().error(f"internal error in recalibrate\n{traceback.format_exc()}")
-            response.success, response.message = False, f"internal error: {type(error).__name__}: {error}"
-        finally:
-            self._recalibration.close()
-            self._recalibration = None
-        return response
-
-    async def _recalibrate(self, recalibration: Recalibration) -> tuple[bool, str]:
-        """Whether the scale was changed, and the sentence for the operator."""
-        while (outcome := recalibration.poll(self.sightings, time.monotonic())) is None:
-            # Slices have their turn meanwhile; the sleep leaves the processor to the thread that measures.
-            time.sleep(_POLL_S)
-            await NextTurn()
-        settings = self._registering.settings
-        if self._registering.frame is not recalibration.frame or settings.scale != recalibration.scale:
-            return False, "calibration refused: the frame or the pixel spacing was changed meanwhile"
-        if not outcome:
-            return False, outcome.message
-        configured = self._configured or recalibration.scale
-        fault = self._set(outcome.scale, "measured", outcome.covariance)
-        if fault:
+    def take(self, outcome: Calibration, frame: Frame) -> tuple[bool, str]:
+        """Use a scale measured from the sightings; returns whether it could be set, and a sentence for the operator."""
+        nominal = self._stated or self._configured
+        if nominal is None:
+            return False, "the measured scale cannot be set: there is none that it could replace"
+        before, self._record = self._record, CalibrationRecord.of(outcome, nominal, frame.name)
+        if fault := self._set(outcome.scale):
+            self._record = before
             return False, f"the measured scale cannot be set: {fault}"
-        if not settings.calibration_file:
+        self._configured = nominal
+        if not self._registering.settings.calibration_file:
             return True, outcome.message
-        path = Path(settings.calibration_file)
+        path = Path(self._registering.settings.calibration_file)
         try:
-            save_calibration(path, CalibrationRecord.of(outcome, configured, recalibration.frame.name))
+            save_calibration(path, self._record)
         except OSError as error:
             self._node.get_logger().warning(f"calibration_file {path} cannot be written: {error}")
             return True, f"{outcome.message}; but it will be forgotten: {path} cannot be written: {error.strerror}"
         return True, outcome.message
 
-    def _on_reset_calibration(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = self._reset()
-        return response
-
-    def _reset(self) -> tuple[bool, str]:
-        """Whether the configured scale is in use again, and the sentence for the operator."""
-        if self._recalibration is not None:
-            return False, "a recalibration is running, wait for its answer"
+    def reset(self) -> tuple[bool, str]:
+        """Forget what was measured; returns whether that is so now, and the sentence for the operator."""
         scale = self._configured
-        if scale is None:
+        if scale is None and self._record is None:
             return False, "pixel_spacing has not been configured, nothing to go back to"
         if self._registering.settings.calibration_file:
             path = Path(self._registering.settings.calibration_file)
@@ -177,11 +163,14 @@ class ScaleKeeper:
                 remove_calibration(path)
             except OSError as error:
                 return False, f"calibration_file {path} cannot be removed: {error.strerror}; nothing was changed"
-        fault = self._set(scale, "configured", None)
+        self._record = None
+        if scale is None:
+            return True, "slices are registered with the pixel spacing that they state"
+        fault = self._set(scale)
         return not fault, fault or f"pixel_spacing is the configured one, [{scale.sx:.9g}, {scale.sy:.9g}] mm/pixel"
 
-    def _set(self, scale: PixelScale, source: Literal["configured", "measured"], covariance: Array | None) -> str:
-        """Change the scale's parameters as one; returns why they cannot be, or nothing."""
+    def _set(self, scale: PixelScale) -> str:
+        """Change the scale's parameters as one, for whoever watches them; returns why they cannot be, or nothing."""
         self._sets_it_itself = True
         try:
             outcome = self._node.set_parameters_atomically(
@@ -192,6 +181,4 @@ class ScaleKeeper:
             )
         finally:
             self._sets_it_itself = False
-        if outcome.successful:
-            self.source, self.covariance = source, covariance
-        return str(outcome.reason)
+        return "" if outcome.successful else str(outcome.reason)

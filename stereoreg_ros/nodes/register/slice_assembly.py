@@ -17,10 +17,11 @@ from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice, SlicePlan
 
 SPACING: Final = "slice_spacing"
 PLANE: Final = "slice_pose"
+FRAME_OF_REFERENCE: Final = "slice_frame_of_reference"
 # A message that is lost on its way is sent again after three seconds, the heartbeat of a reliable writer.
 WAIT_S: Final = 4.0
 CAPACITY: Final = 32
-Part: TypeAlias = PixelScale | SlicePlane
+Part: TypeAlias = PixelScale | SlicePlane | str
 _Stamp: TypeAlias = tuple[int, int]
 
 
@@ -36,12 +37,13 @@ class _Waiting:
     def whole(self) -> IncomingSlice:
         faults = [str(part) for part in self.parts.values() if isinstance(part, MessageError)]
         faults += [f"no {topic} with the image's stamp came within {WAIT_S:g} s" for topic in sorted(self.missing)]
-        spacing, plane = self.parts.get(SPACING), self.parts.get(PLANE)
+        spacing, plane, reference = (self.parts.get(topic) for topic in (SPACING, PLANE, FRAME_OF_REFERENCE))
         return IncomingSlice(
             self.image,
             self.received_s,
             spacing if isinstance(spacing, PixelScale) else None,
             plane if isinstance(plane, SlicePlane) else None,
+            reference if isinstance(reference, str) else None,
             "; ".join(faults),
         )
 
@@ -57,6 +59,7 @@ class SliceAssembly:
         self._parts: dict[str, OrderedDict[_Stamp, Part | MessageError]] = {
             SPACING: OrderedDict(),
             PLANE: OrderedDict(),
+            FRAME_OF_REFERENCE: OrderedDict(),
         }
         self._waiting: list[_Waiting] = []
 

@@ -14,10 +14,19 @@ from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.nodes.common import conversions
 from stereoreg_ros.nodes.common.conversions import MessageError
 from stereoreg_ros.nodes.common.diagnostic_status import status_with
+from stereoreg_ros.nodes.register.parameters import NodeSettings
 from stereoreg_ros.result import Registration
 from stereoreg_ros.uncertainty import error_ball_95, point_covariance
 
 NAME: Final = "target"
+
+
+@dataclass(frozen=True, eq=False)
+class KeptTarget:
+    """A target as it was sent, and when it came, seconds of the steady clock."""
+
+    message: PointStamped
+    received_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +56,7 @@ class TargetInFrame:
 class TargetRefusal:
     """No target that can be steered to: reason, a sentence, the pose's age in s. False as a condition."""
 
-    reason: Literal["bad_target", "no_pose", "pose_too_old", "inaccurate"]
+    reason: Literal["bad_target", "no_pose", "pose_too_old", "target_too_old", "other_frame_of_reference", "inaccurate"]
     message: str
     pose_age_s: float = math.nan
 
@@ -56,7 +65,7 @@ class TargetRefusal:
 
 
 def target_in_frame(
-    target: PointStamped, latest: Accepted | None, now_s: float, max_pose_age_s: float, max_error_mm: float
+    target: KeptTarget, latest: Accepted | None, now_s: float, settings: NodeSettings
 ) -> TargetInFrame | TargetRefusal:
     """Where the target, in scanner axes, is in the frame, by the frame's latest pose; now_s: of the steady clock."""
     if latest is None:
@@ -68,23 +77,31 @@ def target_in_frame(
     age_s = now_s - latest.received_s
     header, registration = latest.header, latest.registration
     try:
-        in_scanner = conversions.point_from_message(target)
-        if target.header.frame_id != header.frame_id:
+        in_scanner = conversions.point_from_message(target.message)
+        if target.message.header.frame_id != header.frame_id:
             raise MessageError(
-                f"its frame_id is '{target.header.frame_id}', expected that of the pose, '{header.frame_id}'"
+                f"its frame_id is '{target.message.header.frame_id}', expected that of the pose, '{header.frame_id}'"
             )
     except MessageError as error:
         return TargetRefusal("bad_target", f"target ignored: {error}", age_s)
-    if age_s > max_pose_age_s:
+    if age_s > settings.max_pose_age:
         return TargetRefusal(
-            "pose_too_old", f"the pose is {age_s:.1f} s old, at most {max_pose_age_s:g} s are allowed", age_s
+            "pose_too_old", f"the pose is {age_s:.1f} s old, at most {settings.max_pose_age:g} s are allowed", age_s
+        )
+    target_age_s = now_s - target.received_s
+    if target_age_s > settings.max_target_age:
+        return TargetRefusal(
+            "target_too_old",
+            f"the target is {target_age_s:.1f} s old, at most {settings.max_target_age:g} s are allowed: send it again",
+            age_s,
         )
     point_mm = registration.scanner_from_frame.inverse() @ in_scanner
     error_mm = error_ball_95(point_covariance(registration.covariance, registration.scanner_from_frame, point_mm))
-    if error_mm > max_error_mm:
+    most_mm = settings.options.max_target_error_mm
+    if error_mm > most_mm:
         return TargetRefusal(
             "inaccurate",
-            f"the target's 95 % error is {error_mm:.2f} mm, at most {max_error_mm:g} mm are allowed",
+            f"the target's 95 % error is {error_mm:.2f} mm, at most {most_mm:g} mm are allowed",
             age_s,
         )
     return TargetInFrame(point_mm, error_mm, header, age_s)

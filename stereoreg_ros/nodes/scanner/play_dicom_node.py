@@ -9,9 +9,8 @@ from rclpy.node import Node
 
 from stereoreg_ros.dicom import DicomError, read_series, read_slice
 from stereoreg_ros.nodes.common.process import run
-from stereoreg_ros.nodes.common.slice_publisher import SlicePublisher
+from stereoreg_ros.nodes.common.slice_publisher import UNUSED_REGISTER_NODE, SlicePublisher
 from stereoreg_ros.nodes.register.parameters import Entry, ParameterError, declare
-from stereoreg_ros.nodes.scanner.tell_spacing import SpacingTeller
 
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02
@@ -21,17 +20,13 @@ ENTRIES: Final = (
     Entry("rate", 1.0, "slices per second", 0.01, 100.0),
     Entry("loop", False, "start again after the last slice, for ever"),
     Entry("frame_id", "scanner", "frame_id of the images and slice poses: the patient axes of the DICOM files"),
-    Entry(
-        "register_node",
-        "register_node",
-        "node that is told the pixel spacing, and without whose consent nothing is played; empty: nobody",
-    ),
+    UNUSED_REGISTER_NODE,
     Entry("wait_for_subscriber", True, "play nothing before somebody subscribes to image"),
 )
 
 
 class PlayDicomNode(Node):
-    """Publishes each slice as `slice_spacing`, `slice_pose` (scanner_from_slice) and `image` (in HU), with one stamp.
+    """Publishes each slice as `image` (in HU) and what belongs to it, with one stamp; see `SlicePublisher`.
 
     A slice that cannot be read is reported and left out.
     finished: the last slice has reached all subscribers; faults: number of slices left out.
@@ -55,8 +50,6 @@ class PlayDicomNode(Node):
             self.get_logger().info(f"skipped {skipped.path}: {skipped.what}")
         if not self._series.headers[0].has_plane:
             self.get_logger().warning(f"{values['path']} has no position and no orientation: no slice_pose")
-        target: str = values["register_node"]
-        self._teller = SpacingTeller(self, target, with_slice_poses=True) if target else None
         self._publisher = SlicePublisher(self, values["frame_id"])
         self._next = 0
         self._due_s = 0.0
@@ -69,11 +62,9 @@ class PlayDicomNode(Node):
         if self._flush_by_s is not None:
             self._flush(self._flush_by_s)
             return
-        # The receiver is asked every time: one that was started anew has to be told anew.
-        told = self._teller is None or self._teller.tell(self._series.headers[0].scale)
         now_s = time.monotonic()
         listened_to = not self._wait_for_subscriber or self._started or self._publisher.listened_to()
-        if not told or now_s < self._due_s or not listened_to:
+        if now_s < self._due_s or not listened_to:
             return
         self._started = True
         # On time, the pace is kept; after a pause it starts afresh instead of catching up.

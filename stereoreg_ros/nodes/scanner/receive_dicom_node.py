@@ -18,7 +18,6 @@ from stereoreg_ros.nodes.register.parameters import ParameterError
 from stereoreg_ros.nodes.scanner.reception_log import NodeLogHandler
 from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings, declare_reception
 from stereoreg_ros.nodes.scanner.registration_answers import RegistrationAnswers
-from stereoreg_ros.nodes.scanner.tell_spacing import SpacingTeller
 from stereoreg_ros.reception.intake import Intake
 from stereoreg_ros.reception.kept_objects import KeptObjects
 from stereoreg_ros.reception.slice_queue import ReceivedSlice, SliceQueue
@@ -38,8 +37,8 @@ _NS_PER_S: Final = 10**9
 class ReceiveDicomNode(Node):
     """Publishes each slice as `slice_spacing`, `slice_pose` and `image` (in HU), in the order of arrival.
 
-    They bear the time of arrival. register_node gets a slice when it has answered the one before: none overflows its
-    queue, and none is registered with the pixel spacing of another.
+    Their stamp is the time of arrival. register_node gets a slice when it has answered the one before, so that none
+    overflows its queue.
     """
 
     def __init__(self) -> None:
@@ -47,16 +46,13 @@ class ReceiveDicomNode(Node):
         self._settings = settings = declare_reception(self)
         self._queue = SliceQueue(settings.max_queue)
         self._publisher = SlicePublisher(self, settings.frame_id)
-        self._teller = (
-            SpacingTeller(self, settings.register_node, with_slice_poses=True) if settings.register_node else None
-        )
         self._answers = RegistrationAnswers(self, settings.register_node)
         self._sent: ReceivedSlice | None = None
         self._sent_stamp = TimeMessage()
         self._answer_by_s = 0.0
         self._tries = 0
         self._answers_before = 0
-        self._sent_to = 0
+        self._sent_to: set[bytes] = set()
         self._waits_for = ""
         self._log_handler = NodeLogHandler(self)
         log = logging.getLogger(stereoreg_ros.reception.__name__)
@@ -133,17 +129,13 @@ class ReceiveDicomNode(Node):
             self._queue.remove_first()
             self._sent, self._tries = None, 0
             received = self._queue.first()
-        if received is not None and self._may_publish(received):
+        if received is not None and self._may_publish():
             self._publish(received)
 
-    def _may_publish(self, received: ReceivedSlice) -> bool:
-        """Whether somebody listens, and register_node knows this slice's pixel spacing."""
-        scale = received.dicom_slice.ct_slice.scale
-        if self._teller is not None:
-            if not self._teller.tell(scale):
-                return False
-            if not self._answers.can_be_heard:
-                return self._wait_for("the diagnostics of register_node")
+    def _may_publish(self) -> bool:
+        """Whether somebody takes the slice, and register_node too where it has to answer."""
+        if self._settings.register_node and not self._answers.processes():
+            return self._wait_for(f"{self._settings.register_node} to take images")
         if self._settings.wait_for_subscriber and not self._publisher.listened_to():
             return self._wait_for("a subscriber of image")
         self._waits_for = ""
@@ -160,32 +152,30 @@ class ReceiveDicomNode(Node):
             self._sent_stamp = self._stamp_of(received)
             self._answers.expect(self._sent_stamp)
         self._answers_before = self._answers.count
-        if self._teller is not None:
-            self._sent_to = self._teller.processes_seen()
+        self._sent_to = self._answers.processes()
         self._publisher.publish(received.dicom_slice, self._sent_stamp)
         self._sent = received
         self._tries += 1
-        self._answer_by_s = time.monotonic() + (ANSWER_S if self._teller else _UNANSWERED_S)
+        self._answer_by_s = time.monotonic() + (ANSWER_S if self._settings.register_node else _UNANSWERED_S)
 
     def _is_done(self, sent: ReceivedSlice) -> bool:
         """Whether the slice that was sent can be let go; one that register_node did not get is sent again."""
         overdue = time.monotonic() > self._answer_by_s
-        if self._teller is None:
+        name = self._settings.register_node
+        if not name:
             return overdue
         answered = self._answers.count > self._answers_before
         if answered and self._answers.came_with(sent.dicom_slice.ct_slice.scale):
             return True
-        replaced = self._teller.processes_seen() != self._sent_to
+        replaced = bool(self._answers.processes() - self._sent_to)
         if not answered and not overdue and not replaced:
             return False
-        self._teller.forget()
-        name = self._settings.register_node
         if answered:
             fault = f"{name} answered a slice with another pixel spacing"
         else:
             fault = f"{name} was started anew" if replaced else f"{name} did not answer a slice within {ANSWER_S:g} s"
         if self._tries < TRIES:
-            self.get_logger().warning(f"{fault}: it is told the spacing and sent the slice again")
+            self.get_logger().warning(f"{fault}: the slice is sent again")
             self._sent = None
             return False
         self.get_logger().error(f"{fault} for the {TRIES}rd time, going on with the next slice")

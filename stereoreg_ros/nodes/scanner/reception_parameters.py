@@ -46,7 +46,7 @@ class ReceptionSettings:
     frame_id: str = setting("scanner", "frame_id of the images and slice poses: the patient axes of the DICOM objects")
     register_node: str = setting(
         "register_node",
-        "node that is told the pixel spacing, and must have answered a slice before it gets the next; empty: nobody",
+        "node that must have answered a slice before the next is published; empty: no answer is waited for",
     )
     wait_for_subscriber: bool = setting(True, "publish nothing before somebody subscribes to image")
 

@@ -1,4 +1,4 @@
-"""Whether register_node has done with an image: its diagnostics bear the image's stamp."""
+"""Whether register_node is there, and whether it has done with a slice: its diagnostics have the slice's stamp."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.common.diagnostic_status import NAME, OTHER_SPACING, name_of_status
+from stereoreg_ros.nodes.common.diagnostic_status import NAME, name_of_status
 
 _QUEUE = 10
 _SAME_SPACING = 1e-4
+# Of the identifier of an endpoint, so much is that of its process.
+_PROCESS_BYTES = 12
 
 
 class RegistrationAnswers:
@@ -20,20 +23,27 @@ class RegistrationAnswers:
     count: of its answers so far, registered or refused.
     """
 
-    def __init__(self, node: Node, register_node: str) -> None:
-        """register_node: its name, seen from the namespace of `node`."""
-        full_name = register_node if register_node.startswith("/") else f"{node.get_namespace()}/{register_node}"
-        self._name = name_of_status(full_name, NAME)
+    def __init__(self, node: Node, register_node: str, image_topic: str = "image") -> None:
+        """register_node: its name, seen from the namespace of `node`; image_topic: on which it gets the slices."""
+        name = register_node if register_node.startswith("/") else f"{node.get_namespace()}/{register_node}"
+        self._node = node
+        self._full_name = "/" + name.lstrip("/")
+        self._status_name = name_of_status(name, NAME)
+        self._image_topic = image_topic
         self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _QUEUE)
         self._stamp: Time | None = None
         self.count = 0
-        self._measured = self._refused_for_spacing = False
+        self._measured = False
         self._spacing = (0.0, 0.0)
 
-    @property
-    def can_be_heard(self) -> bool:
-        """Whether anybody publishes diagnostics; an answer given before is lost."""
-        return bool(self._subscription.get_publisher_count() > 0)
+    def processes(self) -> set[bytes]:
+        """The processes of register_node that take images and whose answers can be heard; an answer before is lost.
+
+        DDS counts a killed process on for a while: this tells it from the one in its place.
+        """
+        takers = self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(self._image_topic))
+        speakers = self._node.get_publishers_info_by_topic("/diagnostics")
+        return self._of_register_node(takers) & self._of_register_node(speakers)
 
     def expect(self, stamp: Time) -> None:
         """Wait for answers to the image of this stamp."""
@@ -41,19 +51,23 @@ class RegistrationAnswers:
 
     def came_with(self, scale: PixelScale) -> bool:
         """Whether the last answer rests on this pixel spacing, or on one that was measured in its place."""
-        if self._refused_for_spacing:
-            return False
         return self._measured or np.allclose(self._spacing, (scale.sx, scale.sy), rtol=_SAME_SPACING, atol=0.0)
+
+    def _of_register_node(self, endpoints: list[TopicEndpointInfo]) -> set[bytes]:
+        return {
+            bytes(one.endpoint_gid)[:_PROCESS_BYTES]
+            for one in endpoints
+            if f"{one.node_namespace.rstrip('/')}/{one.node_name}" == self._full_name
+        }
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         if message.header.stamp != self._stamp:
             return
         for status in message.status:
             # Of several frames each has a status, under the same name and its own; the first stands for all.
-            if status.name == self._name or status.name.startswith(f"{self._name} of "):
+            if status.name == self._status_name or status.name.startswith(f"{self._status_name} of "):
                 self.count += 1
                 values = {one.key: one.value for one in status.values}
-                self._refused_for_spacing = status.message.startswith(OTHER_SPACING)
                 self._measured = values["calibration"] == "measured"
                 self._spacing = (float(values["pixel_spacing_x_mm"]), float(values["pixel_spacing_y_mm"]))
                 return

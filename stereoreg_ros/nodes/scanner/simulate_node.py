@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -21,13 +21,12 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message
+from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message, scale_to_message
 from stereoreg_ros.nodes.common.process import run
+from stereoreg_ros.nodes.common.slice_publisher import UNUSED_REGISTER_NODE
 from stereoreg_ros.nodes.register.parameters import ParameterError, declare, entries_of, setting
-from stereoreg_ros.nodes.scanner.tell_spacing import SpacingTeller
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, passage, random_pose, render_slice
 
-TELL_S: Final = 5.0
 POSE_GRACE_S: Final = 1.0
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02
@@ -66,7 +65,7 @@ class SimulationSettings:
     rows: int = setting(512, "rows of the image", 16, 4096)
     columns: int = setting(512, "columns of the image", 16, 4096)
     frame_id: str = setting("scanner", "frame_id of the images and of the true poses")
-    register_node: str = setting("register_node", "node that is told the pixel spacing; empty: nobody")
+    register_node: str = setting("", UNUSED_REGISTER_NODE.description)
     wait_for_subscriber: bool = setting(False, "begin only when somebody subscribes to image, so that no slice is lost")
 
     def __post_init__(self) -> None:
@@ -133,7 +132,7 @@ class Passage:
 
 
 class SimulateNode(Node):
-    """Publishes `true_pose` (scanner_from_frame) and then `image` (in HU, 16SC1), with the same stamp.
+    """Publishes `true_pose` (scanner_from_frame), `slice_spacing` and then `image` (in HU, 16SC1), with one stamp.
 
     finished: the number of slices asked for has been published and has reached all subscribers.
     """
@@ -150,8 +149,7 @@ class SimulateNode(Node):
             raise ParameterError(f"frame_file: {error}") from None
         except ValueError as error:
             raise ParameterError(str(error)) from None
-        target = self._settings.register_node
-        self._teller = SpacingTeller(self, target, with_slice_poses=False) if target else None
+        self._spacing_publisher = self.create_publisher(Vector3Stamped, "slice_spacing", _QOS)
         self._image_publisher = self.create_publisher(Image, "image", _QOS)
         self._pose_publisher = self.create_publisher(PoseStamped, "true_pose", _TRUTH_QOS)
         self._published = 0
@@ -168,8 +166,7 @@ class SimulateNode(Node):
         if self._flush_by_s is not None:
             self._flush(self._flush_by_s)
             return
-        told = self._teller is None or self._teller.tell(self._passage.scanner.scale)
-        if now_s < self._due_s or not (self._published or self._may_begin(now_s, told)):
+        if now_s < self._due_s or not (self._published or self._may_begin(now_s)):
             return
         # On time, the pace is kept; after a pause it starts afresh instead of catching up.
         period_s = 1.0 / self._settings.rate
@@ -179,8 +176,8 @@ class SimulateNode(Node):
         if self._published == self._settings.slices:
             self._flush_by_s = time.monotonic() + FLUSH_S
 
-    def _may_begin(self, now_s: float, told: bool) -> bool:
-        """Whether the first slice may go out: somebody takes it if that matters, and the spacing was told."""
+    def _may_begin(self, now_s: float) -> bool:
+        """Whether the first slice may go out: where that matters, somebody takes it."""
         if self._settings.wait_for_subscriber and self._image_publisher.get_subscription_count() == 0:
             self._audience_s = None
             return False
@@ -189,19 +186,13 @@ class SimulateNode(Node):
         waited_s = now_s - self._audience_s
         # Who judges by true_pose subscribes to it besides, and may be discovered a little later.
         poses_taken = self._pose_publisher.get_subscription_count() > 0 or waited_s >= POSE_GRACE_S
-        if self._settings.wait_for_subscriber and not poses_taken:
-            return False
-        if not told and waited_s < TELL_S:
-            return False
-        if not told:
-            self.get_logger().warning(
-                f"{self._settings.register_node} did not accept the pixel spacing within {TELL_S:g} s: begins without"
-            )
-        return True
+        return poses_taken or not self._settings.wait_for_subscriber
 
     def _publish(self, ct_slice: Slice, scanner_from_frame: Pose) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._settings.frame_id)
         self._pose_publisher.publish(PoseStamped(header=header, pose=pose_to_message(scanner_from_frame)))
+        spacing = scale_to_message(ct_slice.scale)
+        self._spacing_publisher.publish(Vector3Stamped(header=header, vector=spacing))
         image = image_from_hu(ct_slice.hu.astype(np.int16))
         image.header = header
         self._image_publisher.publish(image)
@@ -215,7 +206,8 @@ class SimulateNode(Node):
     def _flush(self, deadline_s: float) -> None:
         """Finish when every subscriber has everything, or at the deadline."""
         now = Duration(seconds=0)
-        if self._pose_publisher.wait_for_all_acked(now) and self._image_publisher.wait_for_all_acked(now):
+        publishers = (self._pose_publisher, self._spacing_publisher, self._image_publisher)
+        if all(publisher.wait_for_all_acked(now) for publisher in publishers):
             self.finished = True
             self.get_logger().info(f"published {self._published} slices")
         elif time.monotonic() > deadline_s:
