@@ -44,7 +44,7 @@ class Output:
         self.messages: dict[str, Any] = {}
         self.transforms: list[TransformStamped] = []
         node: Any = SimpleNamespace(create_publisher=self._topic)
-        self.output = FrameOutput(FRAME, FrameTopics(node, prefix))
+        self.output = FrameOutput(FRAME, FrameTopics(node, prefix), "cube")
 
     def _topic(self, _type: type, name: str, _profile: object, **_: object) -> Any:
         assert name not in self.messages
@@ -52,7 +52,7 @@ class Output:
         return SimpleNamespace(publish=lambda message: self.messages.update({name: message}))
 
     def publish(self, result: Registration | Refusal) -> None:
-        self.output.publish(result, HEADER, 77.5, "cube", self.transforms.append)
+        self.output.publish(result, HEADER, 77.5, self.transforms.append)
 
 
 def test_pose_covariance_and_transform_are_of_one_slice_in_the_scanner() -> None:
@@ -85,7 +85,7 @@ def test_of_a_refused_slice_nothing_goes_out_and_no_pose_is_left() -> None:
 
 def test_a_target_has_the_stamp_of_its_pose_and_the_axes_of_the_frame() -> None:
     made = Output()
-    made.output.publish_target(TargetInFrame(np.array([10.0, -20.0, 30.0]), 0.5, HEADER, 1.5), "cube")
+    made.output.publish_target(TargetInFrame(np.array([10.0, -20.0, 30.0]), 0.5, HEADER, 1.5))
     target = made.messages["target_in_frame"]
     assert (target.header.stamp, target.header.frame_id) == (HEADER.stamp, "cube")
     assert (target.point.x, target.point.y, target.point.z) == pytest.approx((0.01, -0.02, 0.03))

@@ -393,7 +393,11 @@ def test_without_frame_and_spacing_the_node_waits_for_them(client, tmp_path):
         without_frame = bench.refusal(image_of(hu), "bad_frame", str(broken))
         assert str(broken) in process.output
         assert bench.set(frame_file="cube6") == ""
-        without_spacing = bench.refusal(image_of(hu), "bad_image", "pixel_spacing is not told yet, set the parameter")
+        without_spacing = bench.refusal(
+            image_of(hu),
+            "bad_image",
+            "pixel_spacing is not set, and the slice came without slice_spacing: set the parameter",
+        )
         assert not bench.call("recalibrate").success
         assert not bench.call("reset_calibration").success
         assert bench.set(pixel_spacing=[SCALE.sx, SCALE.sy]) == ""

@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.common.diagnostic_status import OTHER_SPACING
 from stereoreg_ros.nodes.scanner.registration_answers import RegistrationAnswers
 from support.contract import STATUS_NAME
 
@@ -28,7 +27,16 @@ class Heard:
     def __init__(
         self, register_node: str = "register_node", namespace: str = "/", expected: Time | None = STAMP
     ) -> None:
-        node: Any = SimpleNamespace(create_subscription=self._subscribe, get_namespace=lambda: namespace)
+        self.takers: list[SimpleNamespace] = []
+        self.speakers: list[SimpleNamespace] = []
+        self.topics: set[str] = set()
+        node: Any = SimpleNamespace(
+            create_subscription=self._subscribe,
+            get_namespace=lambda: namespace,
+            resolve_topic_name=lambda topic: f"{namespace.rstrip('/')}/{topic}",
+            get_subscriptions_info_by_topic=lambda topic: self._endpoints(topic, self.takers),
+            get_publishers_info_by_topic=lambda topic: self._endpoints(topic, self.speakers),
+        )
         self.answers = RegistrationAnswers(node, register_node)
         if expected is not None:
             self.answers.expect(expected)
@@ -37,13 +45,16 @@ class Heard:
         assert topic == "/diagnostics"
         self.hear = callback
 
+    def _endpoints(self, topic: str, endpoints: list[SimpleNamespace]) -> list[SimpleNamespace]:
+        self.topics.add(topic)
+        return endpoints
+
     def answer(self, *statuses: DiagnosticStatus, stamp: Time = STAMP) -> None:
         self.hear(DiagnosticArray(header=Header(stamp=stamp), status=list(statuses)))
 
 
 def status(
     name: str = STATUS_NAME,
-    message: str = "",
     calibration: str = "configured",
     spacing: tuple[float, float] = (0.5, 0.6),
 ) -> DiagnosticStatus:
@@ -52,9 +63,7 @@ def status(
         "pixel_spacing_x_mm": str(spacing[0]),
         "pixel_spacing_y_mm": str(spacing[1]),
     }
-    return DiagnosticStatus(
-        name=name, message=message, values=[KeyValue(key=key, value=value) for key, value in values.items()]
-    )
+    return DiagnosticStatus(name=name, values=[KeyValue(key=key, value=value) for key, value in values.items()])
 
 
 def test_only_answers_with_the_stamp_of_the_slice_count() -> None:
@@ -133,17 +142,27 @@ def test_the_answer_has_to_rest_on_the_slices_spacing(spacing: tuple[float, floa
     assert bool(heard.answers.came_with(SCALE)) is is_this
 
 
-def test_a_measured_spacing_stands_in_the_place_of_the_one_that_was_told() -> None:
+def test_a_measured_spacing_stands_in_the_place_of_the_one_that_the_slice_states() -> None:
     heard = Heard()
     heard.answer(status(calibration="measured", spacing=(0.507, 0.593)))
     assert heard.answers.came_with(SCALE)
 
 
-def test_refused_for_another_spacing_it_does_not_rest_on_it_whatever_it_says() -> None:
-    heard = Heard()
-    for calibration in ("configured", "measured"):
-        heard.answer(status(message=f"{OTHER_SPACING} 0.5 x 0.6 mm, expected ...", calibration=calibration))
-        assert not heard.answers.came_with(SCALE)
-    # The last answer counts.
-    heard.answer(status(message="the image's sides are exchanged"))
-    assert heard.answers.came_with(SCALE)
+def endpoint(process: int, name: str = "register_node", namespace: str = "/") -> SimpleNamespace:
+    """An endpoint of a process, by its identifier: twelve bytes of the process, and four of the endpoint."""
+    gid = [process] * 12 + [len(name), 1, 2, 3]
+    return SimpleNamespace(node_name=name, node_namespace=namespace, endpoint_gid=gid)
+
+
+def test_only_a_process_of_register_node_that_takes_images_and_answers_is_there() -> None:
+    heard = Heard("register_node", "/robot1")
+    heard.takers, heard.speakers = [endpoint(1, namespace="/robot1")], []
+    assert heard.answers.processes() == set()
+    heard.speakers = [endpoint(2, namespace="/robot1"), endpoint(1, "viewer", "/robot1"), endpoint(1)]
+    assert heard.answers.processes() == set()
+    heard.speakers.append(endpoint(1, namespace="/robot1"))
+    assert heard.answers.processes() == {bytes([1] * 12)}
+    # Another process comes in its place, while DDS still counts the one that was killed.
+    heard.takers.append(endpoint(2, namespace="/robot1"))
+    assert heard.answers.processes() == {bytes([1] * 12), bytes([2] * 12)}
+    assert heard.topics == {"/robot1/image", "/diagnostics"}

@@ -16,21 +16,23 @@ pytest.importorskip("rclpy", reason="ROS 2 is not there")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from stereoreg_ros import Pose, load_frame
 from stereoreg_ros.nodes.common import conversions
 from stereoreg_ros.nodes.register import register_node
+from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice
+from stereoreg_ros.nodes.register.parameters import NodeSettings
 from stereoreg_ros.nodes.register.targets import (
     Accepted,
+    KeptTarget,
     TargetInFrame,
     TargetRefusal,
     status_of_target,
     target_in_frame,
 )
-from stereoreg_ros.options import RegistrationOptions
+from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 from stereoreg_ros.result import PoseEstimate, Registration
 from stereoreg_ros.simulation import PlacedFrame, render_slice
 from stereoreg_ros.uncertainty import error_ball_95
@@ -52,9 +54,15 @@ def latest(frame_id: str = "ct") -> Accepted:
 
 
 def answer(
-    target: PointStamped, pose: Accepted | None, now_s: float = 101.0, max_error_mm: float = 3.0
+    target: PointStamped,
+    pose: Accepted | None,
+    now_s: float = 101.0,
+    max_error_mm: float = 3.0,
+    received_s: float = 100.5,
 ) -> TargetInFrame | TargetRefusal:
-    return target_in_frame(target, pose, now_s, 60.0, max_error_mm)
+    options = RegistrationOptions(max_target_error_mm=max_error_mm)
+    settings = NodeSettings(options, CalibrationOptions(), max_pose_age=60.0, max_target_age=90.0)
+    return target_in_frame(KeptTarget(target, received_s), pose, now_s, settings)
 
 
 def test_a_target_is_told_in_the_frames_axes_with_error_age_and_header_of_the_pose():
@@ -124,6 +132,16 @@ def test_a_pose_may_be_as_old_as_is_allowed_and_no_older():
     assert outcome.pose_age_s == 60.25
 
 
+def test_a_target_may_be_as_old_as_is_allowed_and_no_older():
+    """The patient may have moved since; the pose says nothing of that."""
+    assert answer(target_of([1, 2, 3]), latest(), 150.0, received_s=60.0)
+    outcome = answer(target_of([1, 2, 3]), latest(), 150.25, received_s=60.0)
+    assert isinstance(outcome, TargetRefusal)
+    assert outcome.reason == "target_too_old"
+    assert outcome.message == "the target is 90.2 s old, at most 90 s are allowed: send it again"
+    assert outcome.pose_age_s == 50.25
+
+
 def test_an_error_may_be_as_large_as_is_allowed_and_no_larger():
     assert answer(target_of([1, 2, 3]), latest(), max_error_mm=ERROR_MM)
     outcome = answer(target_of([1, 2, 3]), latest(), max_error_mm=0.999 * ERROR_MM)
@@ -137,7 +155,7 @@ def test_an_error_may_be_as_large_as_is_allowed_and_no_larger():
 
 def test_the_status_of_an_answer_holds_its_numbers():
     status = status_of_target(TargetInFrame(np.array([5.0, -1.0, 3.0]), 0.5, Header(), 2.5), "cube6", "ct")
-    assert (status.level, status.name, status.hardware_id) == (DiagnosticStatus.OK, "register_node: target", "ct")
+    assert (status.level, status.name, status.hardware_id) == (DiagnosticStatus.OK, "target", "ct")
     assert status.message == "target at (5.0, -1.0, 3.0) mm in the frame, to 0.50 mm (95 %)"
     assert values_of(status) == {
         "outcome": "accepted",
@@ -151,7 +169,10 @@ def test_the_status_of_an_answer_holds_its_numbers():
     }
 
 
-@pytest.mark.parametrize("reason", ["bad_target", "no_pose", "pose_too_old", "inaccurate"])
+@pytest.mark.parametrize(
+    "reason",
+    ["bad_target", "no_pose", "pose_too_old", "target_too_old", "other_frame_of_reference", "inaccurate"],
+)
 def test_the_status_of_a_refusal_holds_no_numbers(reason):
     status = status_of_target(TargetRefusal(reason, "so it is", 61.0), "cube6", "ct")
     assert (status.level, status.message, status.hardware_id) == (DiagnosticStatus.ERROR, "so it is", "ct")
@@ -316,15 +337,17 @@ def test_a_faulty_target_ends_the_one_before_and_is_forgotten(bench, faulty):
 def test_a_skipped_slice_leaves_the_pose_before(monkeypatch):
     """It says nothing of the frame, and the next slice is waiting."""
     told: list[DiagnosticArray] = []
-    monkeypatch.setattr(register_node, "_PREPARE_S", 0.0)
+    monkeypatch.setattr(register_node, "_PREPARE_AT_START_S", 0.0)
+    at_once = SimpleNamespace(is_free=True, submit=lambda work, then: then(work()))
     with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_diagnostics", SimpleNamespace(publish=told.append))
-        node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
+        monkeypatch.setattr(node, "_worker", at_once)
         image = image_of(rendered(2)[0])
         image.header.frame_id = "ct"
-        node._on_image(image, {"received_timestamp": time.time_ns()})
-        node._skip(image)
-        node._on_target(target_of([1.0, 2.0, 3.0]))
+        incoming = IncomingSlice(image, time.monotonic(), SCALE)
+        node._begin(incoming)
+        node._skip(incoming)
+        node._target._on_target(target_of([1.0, 2.0, 3.0]))
     assert [values_of(status)["reason"] for array in told for status in array.status] == ["", "skipped", ""]
 
 

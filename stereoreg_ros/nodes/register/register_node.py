@@ -395,8 +395,7 @@ _OF_THE_TABLES: Final = {
 }
 _NO_TF2: Final = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
 _NO_SPACING: Final = (
-    "nobody has said what a pixel is: the slice came without slice_spacing, and pixel_spacing is not set, expected "
-    "[sx, sy] in mm/pixel"
+    "pixel_spacing is not set, and the slice came without slice_spacing: set the parameter to [sx, sy] in mm/pixel"
 )
 
 
