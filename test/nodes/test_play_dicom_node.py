@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +13,9 @@ from support.dicom_files import SHARED_DATA, real, write_slice
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import parameter_value_to_python
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from support.ros_process import RosClient, node_process
 from support.scanner_nodes import pixels, play
@@ -38,24 +35,6 @@ def series(tmp_path):
     for z, number in enumerate([3, 0, 4, 1, 2]):
         write_slice(tmp_path / f"{number}.dcm", IMAGE + z, 2.5 * z, InstanceNumber=number, PixelSpacing=[0.7, 0.4])
     return tmp_path
-
-
-class Receiver:
-    """Stands in for register_node: takes parameters, or refuses them while `refusal` is a sentence."""
-
-    def __init__(self, client: RosClient, name: str = "register_node") -> None:
-        self.refusal = ""
-        self.told: list[dict[str, Any]] = []
-        self._node = client.node
-        self._service = client.node.create_service(SetParametersAtomically, f"{name}/set_parameters_atomically", self)
-
-    def __call__(self, request, response):
-        self.told.append({one.name: parameter_value_to_python(one.value) for one in request.parameters})
-        response.result = SetParametersResult(successful=not self.refusal, reason=self.refusal)
-        return response
-
-    def leave(self):
-        self._node.destroy_service(self._service)
 
 
 def test_folder_is_played_once_in_table_order(client, series):
@@ -131,42 +110,22 @@ def test_without_waiting_it_plays_to_nobody(series):
         assert "played 5 of 5 slices" in player.output
 
 
-def test_nothing_is_played_before_the_spacing_is_accepted(client, series):
-    receiver = Receiver(client)
-    receiver.refusal = "no such spacing here"
-    with play(series, register_node="register_node") as player:
-        poses, images = client.collect(PoseStamped, "slice_pose"), client.collect(Image, "image")
-        client.wait_for(lambda: "no such spacing here" in player.output, "the refusal in the player's log")
-        assert not images
-        receiver.refusal = ""
-        client.wait_for(lambda: len(images) == len(poses) == 5, "five slices")
-        assert player.output.count("no such spacing here") == 1
-    assert receiver.told[-1] == {"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0, "slice_pose_required": True}
-
-
-def test_target_lies_in_the_namespace_of_the_player(series):
-    with RosClient(namespace="/left") as client:
-        receiver = Receiver(client, "robot")
-        with play(series, "-r", "__ns:=/left", register_node="robot"):
-            poses, images = client.collect(PoseStamped, "slice_pose"), client.collect(Image, "image")
-            client.wait_for(lambda: len(images) == len(poses) == 5, "five slices")
-        assert receiver.told == [{"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0, "slice_pose_required": True}]
-
-
-def test_receiver_that_starts_anew_is_told_anew(client, series):
-    first = Receiver(client)
-    with play(series, register_node="register_node", rate=20.0, loop=True) as player:
+def test_each_slice_brings_its_spacing_and_its_frame_of_reference(client, tmp_path):
+    """By which a register_node knows what to make of it, whatever it was started with."""
+    uids = ["1.2.826.1", "1.2.826.1", None]
+    for z, uid in enumerate(uids):
+        write_slice(tmp_path / f"{z}.dcm", IMAGE + z, z, PixelSpacing=[0.7, 0.4], FrameOfReferenceUID=uid)
+    with play(tmp_path):
+        spacings = client.collect(Vector3Stamped, "slice_spacing")
+        references = client.collect(Header, "slice_frame_of_reference")
         client.collect(PoseStamped, "slice_pose")
         images = client.collect(Image, "image")
-        client.wait_for(lambda: images, "a slice")
-        waiting = "waiting for the parameter service of register_node"
-        before = player.output.count(waiting)
-        first.leave()
-        client.wait_for(lambda: player.output.count(waiting) > before, "the player to notice")
-        second = Receiver(client)
-        played = len(images)
-        client.wait_for(lambda: len(images) > played + 5, "more slices")
-    assert second.told == first.told == [{"pixel_spacing": [0.4, 0.7], "pixel_shear": 0.0, "slice_pose_required": True}]
+        client.wait_for(lambda: min(map(len, (spacings, references, images))) == 3, "three slices")
+    stamps = [image.header.stamp for image in images]
+    assert [one.header.stamp for one in spacings] == stamps
+    assert [one.stamp for one in references] == stamps
+    assert [(1e3 * one.vector.x, 1e3 * one.vector.y, one.vector.z) for one in spacings] == [(0.4, 0.7, 0.0)] * 3
+    assert [one.frame_id for one in references] == ["1.2.826.1", "1.2.826.1", ""]
 
 
 def test_faulty_slice_is_left_out_and_reported(client, series):
@@ -185,7 +144,6 @@ def test_faulty_slice_is_left_out_and_reported(client, series):
         ({"path": "/nowhere"}, "/nowhere: no such file, expected a DICOM file"),
         ({"rate": 0.0}, "rate"),
         ({"rate": 5}, "rate"),
-        ({"register_node": "two words"}, "'two words' is no name of a node"),
     ],
 )
 def test_it_does_not_start_on_wrong_parameters(series, parameters, sentence):

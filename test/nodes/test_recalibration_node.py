@@ -17,7 +17,6 @@ from stereoreg_ros.calibration.file import CalibrationRecord, load_calibration, 
 from stereoreg_ros.geometry.pose import rotation_exp
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.nodes.common.conversions import covariance_to_message, pose_to_message
-from stereoreg_ros.nodes.common.diagnostic_status import OTHER_SPACING
 from stereoreg_ros.simulation import PlacedFrame, centred_pose, random_pose, render_slice
 from support.register_bench import (
     CUBE,
@@ -66,10 +65,11 @@ def wait_until_spacing_is_heard(bench: SpacedBench) -> None:
     """Until the node is known to pair images with the spacing that comes with them."""
 
     def heard() -> bool:
-        return str(bench.status(bench.send_spaced(SLICES[0][0], OTHER)).message).startswith(OTHER_SPACING)
+        values = values_of(bench.status(bench.send_spaced(SLICES[0][0], OTHER)))
+        return float(values["pixel_spacing_x_mm"]) == pytest.approx(OTHER.sx)
 
     bench.client.announce(f"{bench.namespace}/slice_spacing", Vector3Stamped)
-    bench.client.wait_for(heard, "the refusal of another spacing than was told")
+    bench.client.wait_for(heard, "a slice to be registered with its own spacing")
 
 
 def forget_slices(bench: Bench) -> None:

@@ -17,18 +17,13 @@ pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from stereoreg_ros import PixelScale, load_frame, register_slice
+from stereoreg_ros import load_frame, register_slice
 from stereoreg_ros.dicom import read_series
 from stereoreg_ros.nodes.common.conversions import pose_from_message
-from stereoreg_ros.nodes.common.diagnostic_status import OTHER_SPACING
-from stereoreg_ros.nodes.scanner.tell_spacing import SpacingTeller
 from support.contract import STATUS_NAME
 from support.register_bench import SCALE, Bench, image_of, of_stamp, rendered
 from support.ros_process import RosClient, node_process
@@ -153,7 +148,9 @@ def test_slices_wait_for_register_node_and_for_the_one_that_takes_its_place(clie
         port = port_of(process, client)
         images = client.collect(Image, "image")
         assert [one.Status for one in send(port, *paths[:2])] == [SUCCESS] * 2
-        client.wait_for(lambda: "waiting for the parameter service" in process.output, "the receiver to wait")
+        client.wait_for(
+            lambda: "slices wait for register_node to take images" in process.output, "the receiver to wait"
+        )
         assert not images
         with register_process():
             wait_for_slices(client, images, 2)
@@ -166,8 +163,8 @@ def test_slices_wait_for_register_node_and_for_the_one_that_takes_its_place(clie
     assert in_order == list(range(6))
 
 
-def test_a_register_node_that_was_killed_unnoticed_is_told_anew_and_sent_the_slice_again(client, tmp_path):
-    """DDS goes on counting a killed process for a while: its successor knows no spacing, and says so."""
+def test_a_slice_sent_to_a_register_node_that_was_killed_unnoticed_is_sent_again_to_its_successor(client, tmp_path):
+    """DDS goes on counting a killed process for a while: nothing but its successor's coming shows that it is gone."""
     paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE + z, z, PixelSpacing=[0.6, 0.3]) for z in range(4)]
     with receiving_process(register_node="register_node") as process:
         port = port_of(process, client)
@@ -184,64 +181,43 @@ def test_a_register_node_that_was_killed_unnoticed_is_told_anew_and_sent_the_sli
 
 
 class SlowRegisterNode:
-    """Stands in for register_node, and answers an image when it is told to."""
+    """Stands in for register_node, and answers an image when it is asked to."""
 
-    def __init__(self, client: RosClient) -> None:
-        self.spacings: list[list[float]] = []
+    def __init__(self) -> None:
         self.stamps: list[Any] = []
-        self._answers = client.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        client.node.create_subscription(Image, "image", self._on_image, 10)
-        client.node.create_subscription(PoseStamped, "slice_pose", lambda pose: None, 10)
-        client.node.create_service(
-            SetParametersAtomically, "register_node/set_parameters_atomically", self._on_parameters
-        )
+        self.client = RosClient("register_node")
+        self._answers = self.client.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.client.node.create_subscription(PoseStamped, "slice_pose", lambda pose: None, 10)
+        self.client.node.create_subscription(Image, "image", self._on_image, 10)
 
     def _on_image(self, image: Any) -> None:
         self.stamps.append(image.header.stamp)
 
-    def _on_parameters(self, request, response):
-        values = {one.name: parameter_value_to_python(one.value) for one in request.parameters}
-        self.spacings.append(list(values["pixel_spacing"]))
-        response.result = SetParametersResult(successful=True)
-        return response
-
-    def answer(self, number: int, message: str = "", calibration: str = "configured") -> None:
-        """Answer the image that came as the one of this number, with the spacing told last."""
-        sx, sy = self.spacings[-1]
+    def answer(self, number: int, spacing: tuple[float, float], calibration: str = "configured") -> None:
+        """Answer the image that came as the one of this number, as registered with this spacing."""
+        sx, sy = spacing
         values = {"calibration": calibration, "pixel_spacing_x_mm": str(sx), "pixel_spacing_y_mm": str(sy)}
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        status = DiagnosticStatus(name=STATUS_NAME, message=message, values=pairs)
+        status = DiagnosticStatus(name=STATUS_NAME, values=pairs)
         self._answers.publish(DiagnosticArray(header=Header(stamp=self.stamps[number]), status=[status]))
 
 
-def test_a_slice_that_is_refused_for_its_spacing_is_sent_again_once_that_is_told(client, tmp_path):
-    """Somebody else has told another spacing between the telling and the slice."""
-    slow = SlowRegisterNode(client)
-    with receiving_process(register_node="register_node") as process:
+def test_a_slice_that_was_registered_with_another_spacing_is_sent_again(tmp_path):
+    """As by a register_node that has not heard of the spacings yet."""
+    slow = SlowRegisterNode()
+    with slow.client as client, receiving_process(register_node="register_node") as process:
         port = port_of(process, client)
-        path = write_slice(tmp_path / "a.dcm", IMAGE, PixelSpacing=[0.5, 0.5])
-        assert [one.Status for one in send(port, path)] == [SUCCESS]
-        client.wait_for(lambda: slow.stamps, "the slice")
-        # With a measured spacing in use, the figure alone does not show it.
-        slow.answer(0, message=f"{OTHER_SPACING} another", calibration="measured")
+        paths = [write_slice(tmp_path / f"{z}.dcm", IMAGE, z, PixelSpacing=[0.5, 0.5]) for z in range(2)]
+        assert [one.Status for one in send(port, *paths)] == [SUCCESS] * 2
+        client.wait_for(lambda: slow.stamps, "the first slice")
+        slow.answer(0, (0.5, 0.505))
         client.wait_for(lambda: len(slow.stamps) >= 2, "the slice again")
         assert slow.stamps[0] == slow.stamps[1]
-        assert slow.spacings == [[0.5, 0.5]] * 2
-        slow.answer(1)
-
-
-def test_whoever_takes_the_place_of_register_node_is_told_anew(client):
-    """A killed process is counted for a while: nothing but its successor's coming shows that it is gone."""
-    teller = SpacingTeller(client.node, "register_node", with_slice_poses=True)
-    scale = PixelScale(0.6, 0.3)
-    with register_process() as killed:
-        client.wait_for(lambda: teller.tell(scale), "the first to be told")
-        killed.kill()
-    with register_process():
-        client.wait_for(lambda: not teller.tell(scale), "the second to be noticed")
-        client.wait_for(lambda: teller.tell(scale), "the second to be told")
-        (spacing,) = client.get_parameters("register_node", "pixel_spacing")
-        assert list(spacing) == [0.6, 0.3]
+        # What was measured in its place is right.
+        slow.answer(1, (0.507, 0.493), "measured")
+        client.wait_for(lambda: len(slow.stamps) >= 3, "the second slice")
+        assert slow.stamps[2] != slow.stamps[1]
+        slow.answer(2, (0.5, 0.5))
 
 
 def test_a_register_node_that_was_started_anew_publishes_no_pose_before_it_has_a_slice(client):

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.nodes.register.parameters import ParameterError
 from stereoreg_ros.nodes.scanner.registration_answers import RegistrationAnswers
 from support.contract import STATUS_NAME
 
@@ -166,3 +167,9 @@ def test_only_a_process_of_register_node_that_takes_images_and_answers_is_there(
     heard.takers.append(endpoint(2, namespace="/robot1"))
     assert heard.answers.processes() == {bytes([1] * 12), bytes([2] * 12)}
     assert heard.topics == {"/robot1/image", "/diagnostics"}
+
+
+def test_a_name_that_no_node_can_have_is_refused() -> None:
+    with pytest.raises(ParameterError, match="register_node: 'two words' is no name of a node"):
+        Heard("two words")
+    Heard("")  # nobody is waited for

@@ -1,8 +1,9 @@
-"""A slice that bears its own pixel spacing is registered with that or with none, whoever told register_node what."""
+"""A slice that states its pixel spacing is registered with that, whatever the parameter says."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,31 +34,48 @@ def client():
 
 
 def arguments(namespace: str, spacing: PixelScale, *more: str) -> list[str]:
-    told = [f"pixel_spacing:=[{spacing.sx},{spacing.sy}]", *more]
-    return ["--ros-args", "-r", f"__ns:={namespace}", *[part for one in told for part in ("-p", one)]]
+    values = [f"pixel_spacing:=[{spacing.sx},{spacing.sy}]", *more]
+    return ["--ros-args", "-r", f"__ns:={namespace}", *[part for one in values for part in ("-p", one)]]
 
 
-def test_a_node_that_was_told_another_spacing_registers_nothing_until_it_is_told(client):
-    """As one that takes the place of a killed one, and was started with the spacing of another series."""
+def spacing_used(bench: SpacedBench, stamp: Any) -> float:
+    return float(values_of(bench.status(stamp))["pixel_spacing_x_mm"])
+
+
+def test_a_slice_is_registered_with_the_spacing_that_it_states_whatever_the_parameter_says(client):
+    """As by a node that was started with the spacing of another series: a pose with that would have been believed."""
     hu, slice_from_frame = rendered(2)
     with node_process("register_node", *arguments("/other", OTHER)):
         bench = SpacedBench(client, "/other", "/other/image")
         bench.warm_up(bench.diagnostics)
-        # So near that without its spacing it would have been believed.
-        assert values_of(bench.status(bench.send(image_of(hu))))["outcome"] == "accepted"
-        bench.refuse_spaced(hu, SCALE)
-        assert bench.set(pixel_spacing=[SCALE.sx, SCALE.sy]) == ""
-        assert_near(bench.pose(bench.send_spaced(hu, SCALE)), slice_from_frame)
-        # Slices of two series in turn: each other one is refused, and none is wrong.
+        assert spacing_used(bench, bench.send(image_of(hu))) == OTHER.sx
+        # Slices of two series in turn; in those of the other one the frame looks larger and is further off.
         for _ in range(3):
-            bench.refuse_spaced(hu, OTHER)
-            assert_near(bench.pose(bench.send_spaced(hu, SCALE)), slice_from_frame)
-        # From now on an image without its spacing is none that could be trusted.
+            stamp = bench.send_spaced(hu, SCALE)
+            assert_near(bench.pose(stamp), slice_from_frame)
+            assert spacing_used(bench, stamp) == pytest.approx(SCALE.sx, rel=1e-9)
+            stamp = bench.send_spaced(hu, OTHER)
+            assert spacing_used(bench, stamp) == pytest.approx(OTHER.sx, rel=1e-9)
+            off_mm = np.linalg.norm(bench.pose(stamp).translation - slice_from_frame.translation)
+            assert off_mm > 0.5
+        # The parameter is whose it was, and an image that has lost its spacing is not registered with it.
+        assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == [OTHER.sx, OTHER.sy]
         status = bench.status(bench.send(image_of(hu)))
         assert "no slice_spacing with the image's stamp came" in status.message
 
 
-def test_a_measured_spacing_is_used_again_when_the_one_it_stands_for_is_told(client, tmp_path: Path):
+def test_slices_that_state_their_spacing_need_no_parameter(client):
+    hu, slice_from_frame = rendered(2)
+    with node_process("register_node", "--ros-args", "-r", "__ns:=/bare"):
+        bench = SpacedBench(client, "/bare", "/bare/image")
+        # Until the node knows of the spacings, an image is one without.
+        client.announce("/bare/slice_spacing", Vector3Stamped)
+        client.wait_for(lambda: spacing_used(bench, bench.send_spaced(hu, SCALE)) > 0, "a spacing to be used")
+        assert_near(bench.pose(bench.send_spaced(hu, SCALE)), slice_from_frame)
+        assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == [0.0, 0.0]
+
+
+def test_a_measured_spacing_is_used_for_the_slices_that_it_was_measured_for(client, tmp_path: Path):
     path = tmp_path / "scale.yaml"
     variance = (1e-4 * SCALE.sx) ** 2
     covariance = ((variance, 0.0), (0.0, variance))
@@ -67,15 +85,15 @@ def test_a_measured_spacing_is_used_again_when_the_one_it_stands_for_is_told(cli
     with node_process("register_node", *arguments("/measured", OTHER, f"calibration_file:={path}")):
         bench = SpacedBench(client, "/measured", "/measured/image")
         bench.warm_up(bench.diagnostics)
-        for told, calibration in ((OTHER, "measured"), (SCALE, "configured"), (OTHER, "measured")):
-            assert bench.set(pixel_spacing=[told.sx, told.sy], pixel_shear=0.0) == ""
-            stamp = bench.send_spaced(hu, told)
+        # Whoever watches the parameter sees what was measured.
+        assert list(client.get_parameters(bench.node, "pixel_spacing")[0]) == [SCALE.sx, SCALE.sy]
+        # Two scanners in turn, of which one was measured.
+        for stated, calibration in ((OTHER, "measured"), (SCALE, "configured"), (OTHER, "measured")):
+            stamp = bench.send_spaced(hu, stated)
             assert_near(bench.pose(stamp), slice_from_frame)
             values = values_of(bench.status(stamp))
             assert values["calibration"] == calibration
             assert float(values["pixel_spacing_x_mm"]) == pytest.approx(SCALE.sx, rel=1e-9)
-        # What bears the measured one as its own is of another series.
-        bench.refuse_spaced(hu, SCALE)
     assert load_calibration(path) == record
 
 

@@ -228,9 +228,3 @@ class SpacedBench(Bench):
         message.header.stamp = self.next_stamp()
         self.client.publish(f"{self.namespace}/slice_spacing", message)
         return self.send(image_of(hu), stamp=message.header.stamp)
-
-    def refuse_spaced(self, hu: np.ndarray, spacing: PixelScale) -> None:
-        stamp = self.send_spaced(hu, spacing)
-        status = self.status(stamp)
-        assert values_of(status)["reason"] == "bad_image"
-        assert of_stamp(self.poses, stamp) is None

@@ -109,7 +109,7 @@ class ScaleKeeper:
         try:
             record = load_calibration(path)
         except CalibrationFileError as error:
-            log.warning(f"calibration_file is not used, the nominal pixel spacing is: {error}")
+            log.warning(f"calibration_file is not used, the configured pixel_spacing is: {error}")
             return
         if record is None:
             return

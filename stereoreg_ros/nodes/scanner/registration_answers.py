@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.common.diagnostic_status import NAME, name_of_status
+from stereoreg_ros.nodes.register.parameters import ParameterError
 
 _QUEUE = 10
 _SAME_SPACING = 1e-4
@@ -24,10 +27,15 @@ class RegistrationAnswers:
     """
 
     def __init__(self, node: Node, register_node: str, image_topic: str = "image") -> None:
-        """register_node: its name, seen from the namespace of `node`; image_topic: on which it gets the slices."""
+        """register_node: its name, seen from the namespace of `node`, or nothing; image_topic: on which it gets slices.
+
+        Raises ParameterError on a name that ROS does not allow.
+        """
         name = register_node if register_node.startswith("/") else f"{node.get_namespace()}/{register_node}"
         self._node = node
         self._full_name = "/" + name.lstrip("/")
+        if register_node:
+            _require_name(register_node, self._full_name)
         self._status_name = name_of_status(name, NAME)
         self._image_topic = image_topic
         self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _QUEUE)
@@ -71,3 +79,10 @@ class RegistrationAnswers:
                 self._measured = values["calibration"] == "measured"
                 self._spacing = (float(values["pixel_spacing_x_mm"]), float(values["pixel_spacing_y_mm"]))
                 return
+
+
+def _require_name(given: str, full_name: str) -> None:
+    try:
+        validate_full_topic_name(full_name)
+    except InvalidTopicNameException as error:
+        raise ParameterError(f"register_node: '{given}' is no name of a node: {error}") from None
