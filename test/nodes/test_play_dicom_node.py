@@ -8,11 +8,12 @@ import time
 import numpy as np
 import pytest
 
+from support.contract import STATUS_NAME
 from support.dicom_files import SHARED_DATA, real, write_slice
 
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
@@ -174,9 +175,15 @@ def test_with_register_node_on_a_real_slice(client):
     path = real(SHARED_DATA / "leksell_ct" / "slice.dcm")
     parameters = ["--ros-args", "-p", "frame_file:=leksell_ct", "-p", "threshold:=1000.0"]
     with node_process("register_node", *parameters):
-        statuses = client.collect(DiagnosticArray, "/diagnostics")
-        with play(path, register_node="register_node"):
-            client.wait_for(lambda: statuses, "the diagnostics of the slice")
-    values = {one.key: one.value for one in statuses[0].status[0].values}
+        arrays = client.collect(DiagnosticArray, "/diagnostics")
+
+        def of_the_slice() -> list[DiagnosticStatus]:
+            return [status for array in arrays for status in array.status if status.name == STATUS_NAME]
+
+        with play(path) as player:
+            client.wait_for(of_the_slice, "the diagnostics of the slice")
+            assert player.wait() == 0
+    (status,) = of_the_slice()
+    values = {one.key: one.value for one in status.values}
     assert float(values["pixel_spacing_x_mm"]) == float(values["pixel_spacing_y_mm"]) == 0.625
-    assert values["reason"] == "ambiguous", statuses[0].status[0].message
+    assert values["reason"] == "ambiguous", status.message

@@ -68,9 +68,12 @@ def test_the_image_comes_last_with_the_stamp_and_axes_of_all(tmp_path: Path) -> 
     """Who gets the image so has all that belongs to it."""
     read = read_slice(write_slice(tmp_path / "a.dcm", IMAGE, PixelSpacing=[0.7, 0.4], ImageOrientationPatient=AXES))
     output = Output()
-    assert list(output.topics) == ["slice_spacing", "slice_pose", "image"]
+    topics = ["slice_spacing", "slice_pose", "slice_frame_of_reference", "image"]
+    assert list(output.topics) == topics
     published = output.publish(read)
-    assert list(published) == ["slice_spacing", "slice_pose", "image"]
+    assert list(published) == topics
+    reference = published.pop("slice_frame_of_reference")
+    assert (reference.frame_id, reference.stamp) == (read.header.frame_of_reference_uid, STAMP)
     assert {(one.header.frame_id, one.header.stamp.sec, one.header.stamp.nanosec) for one in published.values()} == {
         ("patient", 12, 34)
     }
@@ -84,7 +87,7 @@ def test_a_slice_without_a_plane_has_no_pose(tmp_path: Path) -> None:
     """Not the identity, which would be believed."""
     elements: dict[str, Any] = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
     read = read_slice(write_slice(tmp_path / "a.dcm", IMAGE, **elements))
-    assert list(Output().publish(read)) == ["slice_spacing", "image"]
+    assert list(Output().publish(read)) == ["slice_spacing", "slice_frame_of_reference", "image"]
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice, SlicePlan
 SPACING: Final = "slice_spacing"
 PLANE: Final = "slice_pose"
 FRAME_OF_REFERENCE: Final = "slice_frame_of_reference"
+_TOPICS: Final = (SPACING, PLANE, FRAME_OF_REFERENCE)
 # A message that is lost on its way is sent again after three seconds, the heartbeat of a reliable writer.
 WAIT_S: Final = 4.0
 CAPACITY: Final = 32
@@ -35,9 +36,9 @@ class _Waiting:
     parts: dict[str, Part | MessageError] = field(default_factory=dict)
 
     def whole(self) -> IncomingSlice:
-        faults = [str(part) for part in self.parts.values() if isinstance(part, MessageError)]
+        spacing, plane, reference = parts = [self.parts.get(topic) for topic in _TOPICS]
+        faults = [str(part) for part in parts if isinstance(part, MessageError)]
         faults += [f"no {topic} with the image's stamp came within {WAIT_S:g} s" for topic in sorted(self.missing)]
-        spacing, plane, reference = (self.parts.get(topic) for topic in (SPACING, PLANE, FRAME_OF_REFERENCE))
         return IncomingSlice(
             self.image,
             self.received_s,
@@ -56,11 +57,7 @@ class SliceAssembly:
     """
 
     def __init__(self) -> None:
-        self._parts: dict[str, OrderedDict[_Stamp, Part | MessageError]] = {
-            SPACING: OrderedDict(),
-            PLANE: OrderedDict(),
-            FRAME_OF_REFERENCE: OrderedDict(),
-        }
+        self._parts: dict[str, OrderedDict[_Stamp, Part | MessageError]] = {topic: OrderedDict() for topic in _TOPICS}
         self._waiting: list[_Waiting] = []
 
     def add_image(self, image: Image, received_s: float, expected: Iterable[str]) -> None:
