@@ -6,6 +6,7 @@ import math
 import signal
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from geometry_msgs.msg import Point, PoseStamped, Quaternion
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParametersAtomically
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -25,7 +25,8 @@ from stereoreg_ros import Pose, load_frame
 from stereoreg_ros.geometry.frame_file import shipped_frames
 from stereoreg_ros.geometry.pose import rotation_exp
 from stereoreg_ros.nodes.common import conversions
-from stereoreg_ros.nodes.register import register_node
+from stereoreg_ros.nodes.register import register_node, slice_registration
+from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice
 from stereoreg_ros.nodes.register.parameters import ENTRIES
 from stereoreg_ros.simulation import PlacedFrame, random_pose, render_slice
 from support.register_bench import (
@@ -542,12 +543,14 @@ def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
     def broken(*_: object) -> None:
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr(register_node, "register_frames", broken)
+    monkeypatch.setattr(slice_registration, "register_frames", broken)
     published: list[DiagnosticStatus] = []
+    at_once = SimpleNamespace(is_free=True, submit=lambda work, then: then(work()))
     with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_publish_statuses", lambda statuses, _header: published.extend(statuses))
-        node.set_parameters([Parameter("pixel_spacing", value=[SCALE.sx, SCALE.sy])])
-        node._on_image(image_of(rendered(19)[0]), {"received_timestamp": time.time_ns()})
+        monkeypatch.setattr(node, "_worker", at_once)
+        monkeypatch.setattr(node, "_preparation", None)
+        node._begin(IncomingSlice(image_of(rendered(19)[0]), time.monotonic(), SCALE))
     (status,) = published
     assert values_of(status)["reason"] == "internal_error"
     assert status.message.startswith("internal error: RuntimeError: out of luck; please report it")

@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from stereoreg_ros.nodes.register.stream_status import NAME, StreamStatus
+from stereoreg_ros.nodes.register.stream_status import NAME, StreamCounts, StreamStatus
 
 STALE_S = 10.0
 
@@ -19,7 +19,7 @@ def report(
     stream: StreamStatus, now_s: float, received: int = 0, skipped: int = 0, waiting: int = 0, missing: str = ""
 ) -> dict[str, str]:
     """What is said: the values, and under "" the level and the message."""
-    status = stream.report(now_s, STALE_S, received, skipped, waiting, "the robot", missing)
+    status = stream.report(now_s, StreamCounts(received, skipped, waiting), STALE_S, "the robot", missing)
     assert (status.name, status.hardware_id) == (NAME, "the robot")
     level = {DiagnosticStatus.OK: "OK", DiagnosticStatus.WARN: "WARN", DiagnosticStatus.ERROR: "ERROR"}[status.level]
     return {"": f"{level}: {status.message}"} | {one.key: one.value for one in status.values}

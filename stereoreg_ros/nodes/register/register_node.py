@@ -35,7 +35,7 @@ from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse, ScaleKeeper
 from stereoreg_ros.nodes.register.scale_services import ScaleServices
 from stereoreg_ros.nodes.register.slice_input import SliceInput
 from stereoreg_ros.nodes.register.slice_registration import Registered, SliceSetup, Unusable, register_incoming
-from stereoreg_ros.nodes.register.stream_status import StreamStatus
+from stereoreg_ros.nodes.register.stream_status import StreamCounts, StreamStatus
 from stereoreg_ros.nodes.register.target_keeper import TargetKeeper
 from stereoreg_ros.nodes.register.worker import Worker
 from stereoreg_ros.registration import preparation
@@ -71,6 +71,7 @@ class RegisterNode(Node):
             _prepare(self._preparation, _PREPARE_AT_START_S)
         self._backlog = Backlog()
         self._worker = Worker(self)
+        self._registering = False
         # Counts changes of what slices are registered with.
         self._revision = 0
         # The axes of the last slice, by frame_id and frame of reference, and the spacing that it stated.
@@ -134,6 +135,7 @@ class RegisterNode(Node):
             scale,
         )
         then = partial(self._on_outcome, incoming, setup, self._revision)
+        self._registering = True
         self._worker.submit(partial(register_incoming, incoming, setup), then)
 
     def _fault_of(self, incoming: IncomingSlice, scale: ScaleInUse | None) -> Unusable | None:
@@ -174,6 +176,7 @@ class RegisterNode(Node):
     def _on_outcome(
         self, incoming: IncomingSlice, setup: SliceSetup, revision: int, outcome: Registered | Unusable
     ) -> None:
+        self._registering = False
         try:
             if revision != self._revision:
                 # With what was set meanwhile it may be another pose, or none.
@@ -261,14 +264,10 @@ class RegisterNode(Node):
         now_s = time.monotonic()
         if fault := self._input.fault(now_s):
             self.get_logger().warning(fault, throttle_duration_sec=_REPEAT_WARNING_S)
+        waiting = self._input.waiting + len(self._backlog) + self._registering
+        counts = StreamCounts(self._input.received, self._backlog.skipped, waiting)
         status = self._stream.report(
-            now_s,
-            self.settings.stale_after,
-            self._input.received,
-            self._backlog.skipped,
-            self._input.waiting + len(self._backlog) + (not self._worker.is_free),
-            self.settings.scanner_frame_id,
-            self._missing(),
+            now_s, counts, self.settings.stale_after, self.settings.scanner_frame_id, self._missing()
         )
         self._diagnose_now([status])
 
