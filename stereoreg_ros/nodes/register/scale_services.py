@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
-from queue import Empty, SimpleQueue
-from typing import Final, TypeAlias
+from typing import Final
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -20,12 +20,11 @@ from stereoreg_ros.nodes.register.recalibration import Recalibration
 from stereoreg_ros.nodes.register.scale_keeper import ScaleKeeper
 
 _POLL_S: Final = 0.05
-_ENDING: Final = "calibration refused: the node is ending"
-_Answer: TypeAlias = "Future[tuple[bool, str]]"
+_ENDING: Final = (False, "calibration refused: the node is ending")
 
 
 class ScaleServices:
-    """Recalibration goes on beside the slices: the call waits in a thread of its own, all else happens in the node's.
+    """Recalibration goes on beside the slices: one call waits in a thread of its own, all else is done in the node's.
 
     state: the settings, the frame to measure with (None where none could be loaded), and whether anybody sends slices.
     """
@@ -35,57 +34,46 @@ class ScaleServices:
     ) -> None:
         self._node, self._keeper, self._state = node, keeper, state
         self._recalibration: Recalibration | None = None
-        self._answer: _Answer = Future()
-        self._calls: SimpleQueue[_Answer] = SimpleQueue()
+        # Held by the call that waits: a second one that waited would take the node's last thread.
+        self._called = threading.Lock()
+        self._answer: Future[tuple[bool, str]] = Future()
         self._closed = False
-        self._called = node.create_guard_condition(self._begin)
+        self._wake = node.create_guard_condition(self._begin)
         self._poll = node.create_timer(_POLL_S, self._go_on, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._poll.cancel()
-        own_thread = ReentrantCallbackGroup()
-        node.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=own_thread)
+        own_threads = ReentrantCallbackGroup()
+        node.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=own_threads)
         node.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
 
     def close(self) -> None:
-        """Answer the calls that wait: the node ends."""
+        """Answer a call that waits: the node ends."""
         self._closed = True
-        self._end(False, _ENDING)
-        self._refuse_waiting(_ENDING)
+        self._end(*_ENDING)
 
     def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        answer: _Answer = Future()
-        self._calls.put(answer)
-        if self._closed:
-            self._refuse_waiting(_ENDING)
-        else:
-            self._called.trigger()
-        response.success, response.message = answer.result()
+        if not self._called.acquire(blocking=False):
+            response.success, response.message = False, "a recalibration is running already, wait for its answer"
+            return response
+        try:
+            self._answer = Future()
+            self._wake.trigger()
+            if self._closed:
+                self._end(*_ENDING)
+            response.success, response.message = self._answer.result()
+        finally:
+            self._called.release()
         return response
 
-    def _refuse_waiting(self, message: str) -> None:
-        while (answer := self._next_call()) is not None:
-            answer.set_result((False, message))
-
-    def _next_call(self) -> _Answer | None:
-        try:
-            return self._calls.get_nowait()
-        except Empty:
-            return None
-
     def _begin(self) -> None:
-        while (answer := self._next_call()) is not None:
-            if self._recalibration is not None:
-                answer.set_result((False, "a recalibration is running already, wait for its answer"))
-                continue
-            settings, frame, images_come = self._state()
-            scale = self._keeper.to_measure
-            if frame is None or scale is None or not (self._keeper.sightings or images_come):
-                answer.set_result((False, "no slice has been accepted yet, nothing to calibrate from"))
-                continue
-            deadline_s = time.monotonic() + (settings.calibration_timeout if images_come else 0.0)
-            self._recalibration = Recalibration(frame, scale.scale, settings.options, settings.calibration, deadline_s)
-            self._answer = answer
-            self._poll.reset()
-            self._go_on()
+        settings, frame, images_come = self._state()
+        scale = self._keeper.to_measure
+        if frame is None or scale is None or not (self._keeper.sightings or images_come):
+            self._end(False, "no slice has been accepted yet, nothing to calibrate from")
+            return
+        deadline_s = time.monotonic() + (settings.calibration_timeout if images_come else 0.0)
+        self._recalibration = Recalibration(frame, scale.scale, settings.options, settings.calibration, deadline_s)
+        self._poll.reset()
+        self._go_on()
 
     def _go_on(self) -> None:
         recalibration = self._recalibration
@@ -112,6 +100,7 @@ class ScaleServices:
             self._recalibration.close()
             self._recalibration = None
             self._poll.cancel()
+        if not self._answer.done():
             self._answer.set_result((success, message))
 
     def _on_reset_calibration(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
