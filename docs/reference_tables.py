@@ -23,8 +23,8 @@ from sphinx.util.docutils import SphinxDirective
 
 from stereoreg_ros import PixelScale, load_frame, register_spots
 from stereoreg_ros.cli import main as command_line
+from stereoreg_ros.nodes.common.parameters import Entry, entries_of
 from stereoreg_ros.nodes.register import parameters
-from stereoreg_ros.nodes.register.parameters import Entry, entries_of
 from stereoreg_ros.nodes.register.register_node import RegisterNode
 from stereoreg_ros.nodes.scanner import play_dicom_node
 from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings

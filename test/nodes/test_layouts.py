@@ -14,7 +14,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from rclpy.qos import QoSDurabilityPolicy, QoSReliabilityPolicy
 
-from stereoreg_ros.nodes.register.parameters import Entry, entries_of
+from stereoreg_ros.nodes.common.parameters import Entry, entries_of
 from stereoreg_ros.nodes.scanner.simulate_node import SimulationSettings
 from support.contract import DIAGNOSTIC_KEYS, PUBLISHED, SERVICES, STATUS_NAME, SUBSCRIBED
 from support.node_interface import NodeInterface, interface_of

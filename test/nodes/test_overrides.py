@@ -14,7 +14,7 @@ from support.dicom_files import write_slice
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from stereoreg_ros.nodes.common.overrides import require_declared
-from stereoreg_ros.nodes.register.parameters import ParameterError
+from stereoreg_ros.nodes.common.parameters import ParameterError
 from support.ros_process import NodeProcess
 
 IMAGE = np.zeros((64, 64), np.uint16)

@@ -11,13 +11,8 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter
 
-from stereoreg_ros.nodes.register.parameters import (
-    ENTRIES,
-    NodeSettings,
-    ParameterError,
-    changed_settings,
-    declare_settings,
-)
+from stereoreg_ros.nodes.common.parameters import ParameterError
+from stereoreg_ros.nodes.register.parameters import ENTRIES, NodeSettings, changed_settings, declare_settings
 from stereoreg_ros.nodes.scanner import reception_parameters
 from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings
 from stereoreg_ros.options import MATCHERS, CalibrationOptions, RegistrationOptions

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Header
 
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.register.parameters import ParameterError
+from stereoreg_ros.nodes.common.parameters import ParameterError
 from stereoreg_ros.nodes.scanner.registration_answers import RegistrationAnswers
 from support.contract import STATUS_NAME
 

@@ -58,7 +58,7 @@ class Stand:
     def in_use(self, stated: PixelScale | None = None) -> tuple[PixelScale, str] | None:
         used = self.keeper.scale_for(stated)
         assert used is None or (used.covariance is not None) == (used.source == "measured")
-        return used and (used.scale, used.source)
+        return None if used is None else (used.scale, used.source)
 
 
 def saved(path: Path) -> str:

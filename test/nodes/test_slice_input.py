@@ -33,7 +33,7 @@ class Inputs:
         self.warnings: list[str] = []
         self.slices: list[IncomingSlice] = []
         self.topics: dict[str, Any] = {}
-        monkeypatch.setattr(slice_input.time, "monotonic", lambda: self.now_s)
+        monkeypatch.setattr("stereoreg_ros.nodes.register.slice_input.time.monotonic", lambda: self.now_s)
         monkeypatch.setattr(slice_input, "subscription_of", self._subscribe)
         node: Any = SimpleNamespace(
             create_timer=self._take_timer,

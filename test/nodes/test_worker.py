@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from typing import Any
 
 import pytest
@@ -39,10 +40,11 @@ def test_results_come_in_order_and_only_among_the_callbacks() -> None:
     results: list[tuple[int, bool]] = []
     here = threading.get_ident()
     for number in range(3):
-        worker.submit(
-            lambda number=number: (number, threading.get_ident()),
-            lambda one: results.append((one[0], one[1] != here and threading.get_ident() == here)),
-        )
+
+        def deliver(worked_in: int, number: int = number) -> None:
+            results.append((number, worked_in != here and threading.get_ident() == here))
+
+        worker.submit(threading.get_ident, deliver)
     assert results == []
     node.serve(3)
     assert results == [(0, True), (1, True), (2, True)]
@@ -84,7 +86,7 @@ def test_triggers_that_count_as_one_leave_no_result_behind() -> None:
     hold = threading.Event()
     worker.submit(lambda: hold.wait(60.0), lambda _: None)
     for number in range(3):
-        worker.submit(lambda number=number: number, results.append)
+        worker.submit(partial(int, number), results.append)
     hold.set()
     for _ in range(4):
         assert node.triggered.acquire(timeout=60.0)

@@ -85,6 +85,13 @@ def test_only_nodes_import_ros(path: Path) -> None:
     assert not {module for module in imported(path) if is_ros(module)}
 
 
+@pytest.mark.parametrize("path", [p for p in MODULES if own_part(p) == "nodes"], ids=name_of)
+def test_each_room_of_nodes_knows_what_all_have_in_common_and_itself(path: Path) -> None:
+    room = path.relative_to(PACKAGE).parts[1]
+    used = {module.split(".")[2] for module in imported(path) if module.startswith("stereoreg_ros.nodes.")}
+    assert used <= {room, "common"}
+
+
 def is_ros(module: str) -> bool:
     top = module.split(".")[0]
     return top in {"rclpy", "builtin_interfaces", "rcl_interfaces", "std_srvs"} or top.endswith("_msgs")

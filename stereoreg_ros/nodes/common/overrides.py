@@ -13,7 +13,7 @@ from typing import Any, Final
 import yaml
 from rclpy.node import Node
 
-from stereoreg_ros.nodes.register.parameters import ParameterError
+from stereoreg_ros.nodes.common.parameters import ParameterError
 
 _SECTION: Final = "ros__parameters"
 

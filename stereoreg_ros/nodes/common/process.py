@@ -12,7 +12,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from stereoreg_ros.nodes.common.overrides import require_declared
-from stereoreg_ros.nodes.register.parameters import ParameterError
+from stereoreg_ros.nodes.common.parameters import ParameterError
 
 # A wait without an end at times sleeps through a SIGTERM; this one wakes and looks.
 _WAKE_S = 0.2

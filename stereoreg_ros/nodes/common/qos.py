@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from stereoreg_ros.nodes.register.parameters import ParameterError
+from stereoreg_ros.nodes.common.parameters import ParameterError
 
 # Deep enough that no slice of a stream is lost in a search of a second, and small enough not to hoard memory.
 QUEUE: Final = QoSProfile(depth=30)

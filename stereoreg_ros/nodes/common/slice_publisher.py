@@ -21,7 +21,7 @@ from std_msgs.msg import Header
 
 from stereoreg_ros.dicom import DicomSlice
 from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message, scale_to_message
-from stereoreg_ros.nodes.register.parameters import Entry
+from stereoreg_ros.nodes.common.parameters import Entry
 
 POSE_GRACE_S: Final = 5.0
 # Acknowledgements may come as late as the heartbeat of three seconds, until when nothing may be overwritten.

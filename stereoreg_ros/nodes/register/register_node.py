@@ -22,6 +22,7 @@ from stereoreg_ros.calibration.calibrate import sighting_of
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.common.diagnostic_status import name_of_status, status_of, status_of_unusable
+from stereoreg_ros.nodes.common.parameters import ParameterError
 from stereoreg_ros.nodes.common.process import run
 from stereoreg_ros.nodes.common.qos import QUEUE, publisher_of
 from stereoreg_ros.nodes.common.transforms import broadcaster_of, has_tf2
@@ -29,7 +30,7 @@ from stereoreg_ros.nodes.register.backlog import MOST_WAIT_S, Backlog
 from stereoreg_ros.nodes.register.frame_loading import load_frames
 from stereoreg_ros.nodes.register.frame_output import FrameOutput, FrameTopics
 from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice
-from stereoreg_ros.nodes.register.parameters import NodeSettings, ParameterError, changed_settings, declare_settings
+from stereoreg_ros.nodes.register.parameters import NodeSettings, changed_settings, declare_settings
 from stereoreg_ros.nodes.register.pictures import Pictures
 from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse, ScaleKeeper
 from stereoreg_ros.nodes.register.scale_services import ScaleServices

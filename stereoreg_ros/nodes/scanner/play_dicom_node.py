@@ -8,9 +8,9 @@ from typing import Final
 from rclpy.node import Node
 
 from stereoreg_ros.dicom import DicomError, read_series, read_slice
+from stereoreg_ros.nodes.common.parameters import Entry, ParameterError, declare
 from stereoreg_ros.nodes.common.process import run
 from stereoreg_ros.nodes.common.slice_publisher import UNUSED_REGISTER_NODE, SlicePublisher
-from stereoreg_ros.nodes.register.parameters import Entry, ParameterError, declare
 
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02

@@ -12,9 +12,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 import stereoreg_ros.reception
+from stereoreg_ros.nodes.common.parameters import ParameterError
 from stereoreg_ros.nodes.common.process import run
 from stereoreg_ros.nodes.common.slice_publisher import SlicePublisher
-from stereoreg_ros.nodes.register.parameters import ParameterError
 from stereoreg_ros.nodes.scanner.reception_log import NodeLogHandler
 from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings, declare_reception
 from stereoreg_ros.nodes.scanner.registration_answers import RegistrationAnswers

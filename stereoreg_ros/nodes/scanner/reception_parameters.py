@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from stereoreg_ros.nodes.register.parameters import ParameterError, declare, entries_of, setting
+from stereoreg_ros.nodes.common.parameters import ParameterError, declare, entries_of, setting
 from stereoreg_ros.reception.bounded_socket import Limits
 
 _MAX_TITLE_CHARACTERS = 16

@@ -12,7 +12,7 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.common.diagnostic_status import NAME, name_of_status
-from stereoreg_ros.nodes.register.parameters import ParameterError
+from stereoreg_ros.nodes.common.parameters import ParameterError
 
 _QUEUE = 10
 _SAME_SPACING = 1e-4

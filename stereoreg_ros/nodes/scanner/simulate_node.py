@@ -22,9 +22,9 @@ from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message, scale_to_message
+from stereoreg_ros.nodes.common.parameters import ParameterError, declare, entries_of, setting
 from stereoreg_ros.nodes.common.process import run
 from stereoreg_ros.nodes.common.slice_publisher import UNUSED_REGISTER_NODE
-from stereoreg_ros.nodes.register.parameters import ParameterError, declare, entries_of, setting
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, passage, random_pose, render_slice
 
 POSE_GRACE_S: Final = 1.0
