@@ -58,7 +58,8 @@ def command_of(executable: str) -> list[str]:
     for sourced in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         if sourced and (Path(sourced) / place).is_file():
             return [str(Path(sourced) / place)]
-    return [sys.executable, "-m", f"{PACKAGE}.nodes.{executable}"]
+    (module,) = (REPOSITORY / PACKAGE / "nodes").rglob(f"{executable}.py")
+    return [sys.executable, "-m", ".".join(module.relative_to(REPOSITORY).with_suffix("").parts)]
 
 
 def _python_of(script: Path) -> Path:
