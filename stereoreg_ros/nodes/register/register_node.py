@@ -276,7 +276,7 @@ class RegisterNode(Node):
         overlay = markers = None
         try:
             if overlay_wanted:
-                overlay = conversions.image_from_bgr(draw_overlay(ct_slice, results[0]))
+                overlay = conversions.image_from_bgr(draw_overlay(ct_slice, results))
                 overlay.header = header
             if markers_wanted:
                 named = [(result, self._axes_of(result.frame)) for result in results]
