@@ -48,8 +48,9 @@ def draw_overlay(ct_slice: Slice, results: Registration | Refusal | Sequence[Reg
     zoom = max(1, min(-(-_LEAST_WIDTH // grey.shape[1]), _MOST_ROWS // grey.shape[0]))
     large = cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
     body = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
-    _mark_other_spots(body, zoom, shown)
-    # What was accepted is drawn over what was not.
+    for spot in np.concatenate([result.spots_px for result in shown]):
+        cv2.circle(body, _at(spot, zoom), _radius(zoom), _YELLOW, 1, cv2.LINE_AA)
+    # Over the spots that are rods; and what was accepted over what was not.
     for result in sorted(shown, key=bool):
         _mark_rods(body, zoom, ct_slice, result, f"{result.frame.name} " if len(shown) > 1 else "")
     headlines = [_headline(result) for result in shown]
@@ -106,19 +107,6 @@ def _at(point_px: Array, zoom: int) -> tuple[int, int]:
 
 def _radius(zoom: int) -> int:
     return max(4, round(3.5 * zoom))
-
-
-def _mark_other_spots(picture: cv2.typing.MatLike, zoom: int, results: Sequence[Registration | Refusal]) -> None:
-    # By their places: a frame that had to leave spots to another one counts only those that it was offered.
-    spots = {(float(u), float(v)) for result in results for u, v in result.spots_px}
-    rods = {
-        (float(u), float(v))
-        for result in results
-        if (best := _best(result)) is not None
-        for u, v in result.spots_px[[match.spot for match in best.matches]]
-    }
-    for spot in sorted(spots - rods):
-        cv2.circle(picture, _at(np.array(spot), zoom), _radius(zoom), _YELLOW, 1, cv2.LINE_AA)
 
 
 def _mark_rods(
