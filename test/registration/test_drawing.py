@@ -195,7 +195,7 @@ class TestPicture:
 
 
 class TestSeveralFrames:
-    """Two frames in one slice, of which the second was offered what the first had left."""
+    """Two frames in one slice, of which the second was not offered all spots."""
 
     ZOOM = 4
     HEADER = 116
@@ -208,7 +208,7 @@ class TestSeveralFrames:
         second = replace(FRAME, name="second")
         return (
             replace(first, spots_px=np.concatenate([first.spots_px, spots[: len(estimate.matches)]])),
-            Registration(second, SCALE, RegistrationOptions(), spots, estimate),
+            Registration(second, SCALE, RegistrationOptions(), spots[:-1], estimate),
         )
 
     def near(self, picture: NDArray[np.uint8], colour: tuple[int, int, int], pixel: Array) -> int:
