@@ -128,5 +128,6 @@ def _padding_value(file: Path, dataset: pydicom.Dataset, keyword: str) -> int:
 
 def _wrapped(value: int, bits: int, signed: bool) -> int:
     """The lowest bits of a number, read as a signed or an unsigned one."""
-    lowest = value % 2**bits
-    return lowest - 2**bits if signed and lowest >= 2 ** (bits - 1) else lowest
+    count: int = 1 << bits
+    lowest = value % count
+    return lowest - count if signed and 2 * lowest >= count else lowest

@@ -84,7 +84,7 @@ def test_hu_that_are_not_whole_are_played_as_floats(client, tmp_path):
     np.testing.assert_array_equal(pixels(images[0]), IMAGE * 0.5 - 1024)
 
 
-NO_PLANE = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
+NO_PLANE: dict[str, Any] = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
 
 
 def test_a_slice_without_a_plane_is_refused(tmp_path):
