@@ -25,7 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "uncertainty": {"geometry"},
     "simulation": {"geometry"},
     "dicom": {"files", "geometry"},
-    "reception": {"geometry", "dicom"},
+    "reception": {"files", "geometry", "dicom"},
     "matching": {"geometry", "options", "solvers"},
     "result": {"geometry", "options", "uncertainty"},
     "judgement": {"geometry", "options", "matching", "result"},
