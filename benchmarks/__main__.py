@@ -14,14 +14,13 @@ import cv2
 import numpy as np
 import scipy
 
-from benchmarks import spots
 from benchmarks.matching import BASELINE_FALSE_SPOTS, PROBLEMS, measure, measure_baseline
 from benchmarks.yardstick import Yardstick, seconds_of
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.options import AUTO
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 from stereoreg_ros.spots import find_spots
-from support import artefacts
+from support import artefacts, spot_accuracy
 
 
 def main() -> int:
@@ -39,7 +38,7 @@ def main() -> int:
     finding = [_finding(side, threshold) for side in (512, 1024) for threshold in (2000.0, AUTO)]
     for one in finding:
         print(f"finding the spots of a {one.side} x {one.side} slice, threshold {one.threshold}: {one.ratio:.1f} Y")
-    centres = [_centres(case, arguments.trials) for case in spots.CASES]
+    centres = [_centres(case, arguments.trials) for case in spot_accuracy.CASES]
     scanned = artefacts.measure(max(arguments.trials // 40, 2), 6, 1.0, AUTO)
     print(
         f"in a scan with metal streaks: {scanned[0]} of {scanned[1]} rods found, RMS {scanned[2]:.3f} pixel, "
@@ -118,9 +117,9 @@ def _finding(side: int, threshold: float | str) -> Finding:
     return Finding(side, threshold, median(times), median(times) / median(units))
 
 
-def _centres(case: spots.Case, trials: int) -> spots.Row:
-    row = spots.measure(case, trials)
-    if case is spots.CASES[0]:
+def _centres(case: spot_accuracy.Case, trials: int) -> spot_accuracy.Row:
+    row = spot_accuracy.measure(case, trials)
+    if case is spot_accuracy.CASES[0]:
         print(
             "\ncentres of spots       found  wrong   RMS/px  bias/px  along/px  across/px  x bound  NEES (2 is right)"
         )

@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.yardstick import Yardstick
-from stereoreg_ros import Pose, Registration, RegistrationOptions, load_frame, register_spots
+from stereoreg_ros import RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, rotation_angle
+from stereoreg_ros.geometry.pose import rotation_angle
 from stereoreg_ros.matching import maurin2009
 from stereoreg_ros.registration import prepare
 from stereoreg_ros.simulation import ScannerSettings, SpotSet, SpotSetSettings, centred_pose, random_spot_set
+from support.pose_verdict import is_covered, is_wrong
+from support.rod_layouts import random_rods
 
-WRONG_MM, WRONG_DEG = 2.0, 3.0
-_CHI_SQUARE_6_AT_1E5 = 34.0
 # False spots of the comparison with the paper's search: 60 and 80 % of all.
 BASELINE_FALSE_SPOTS = (9, 24)
 
@@ -92,34 +92,6 @@ def frame_named(name: str) -> Frame:
         frame = load_frame(name)
         return replace(frame, tolerances_mm=np.zeros(len(frame)))
     return random_rods(np.random.default_rng(len(name)), int(name.removeprefix("random")))
-
-
-def random_rods(rng: np.random.Generator, lines: int) -> Frame:
-    """Rods from the lower to the upper face of a cube of 60 mm, no two within 8 mm at an end."""
-    ends: list[Array] = []
-    while len(ends) < lines:
-        drawn = rng.uniform(-30, 30, (2, 2))
-        if all((np.linalg.norm(drawn - other, axis=1) > 8.0).all() for other in ends):
-            ends.append(drawn)
-    both = np.array(ends)
-    low, high = np.full((lines, 1), -30.0), np.full((lines, 1), 30.0)
-    names = tuple(f"r{k}" for k in range(lines))
-    return Frame("random", names, np.hstack([both[:, 0], low]), np.hstack([both[:, 1], high]), np.ones(lines))
-
-
-def is_wrong(found: Pose, truth: Pose) -> bool:
-    """Whether a pose is off by more than WRONG_MM or WRONG_DEG."""
-    turn = np.degrees(rotation_angle(found.rotation @ truth.rotation.T))
-    return bool(np.linalg.norm(found.translation - truth.translation) > WRONG_MM or turn > WRONG_DEG)
-
-
-def is_covered(result: Registration, truth: Pose) -> bool:
-    """Whether the error is within what the registration states: chance alone exceeds it once in 1e5."""
-    error = np.append(
-        result.scanner_from_frame.translation - truth.translation,
-        Rotation.from_matrix(result.scanner_from_frame.rotation @ truth.rotation.T).as_rotvec(),
-    )
-    return float(error @ np.linalg.solve(result.covariance, error)) < _CHI_SQUARE_6_AT_1E5
 
 
 def measure(problem: Problem, trials: int) -> Row:

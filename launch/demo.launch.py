@@ -11,6 +11,8 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from stereoreg_ros.files.given_path import expanded
+
 # The layout names topics from the root; these find them in a namespace.
 _SHOWN = ("markers", "overlay", "pose_with_covariance", "target")
 
@@ -42,22 +44,24 @@ def generate_launch_description() -> LaunchDescription:
                 PythonLaunchDescriptionSource(PathJoinSubstitution([ThisLaunchFileDir(), "register.launch.py"])),
                 launch_arguments=[(name, LaunchConfiguration(name)) for name in names],
             ),
-            Node(
-                package="stereoreg_ros",
-                executable="simulate_node",
-                name="simulate_node",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[
-                    {
-                        "frame_file": ParameterValue(LaunchConfiguration("frame_file"), value_type=str),
-                        "wait_for_subscriber": True,
-                    }
-                ],
-                output="screen",
-            ),
+            OpaqueFunction(function=_simulation),
             OpaqueFunction(function=_rviz),
         ]
     )
+
+
+def _simulation(context: LaunchContext) -> list[Node]:
+    frame_file = expanded("frame_file", LaunchConfiguration("frame_file").perform(context))
+    return [
+        Node(
+            package="stereoreg_ros",
+            executable="simulate_node",
+            name="simulate_node",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[{"frame_file": ParameterValue(frame_file, value_type=str), "wait_for_subscriber": True}],
+            output="screen",
+        )
+    ]
 
 
 def _rviz(context: LaunchContext) -> list[Node | LogInfo]:

@@ -10,6 +10,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from stereoreg_ros.files.given_path import existing_file, expanded
+
 
 def generate_launch_description() -> LaunchDescription:
     """What is started, and its arguments: `ros2 launch -s stereoreg_ros register.launch.py` lists them."""
@@ -42,10 +44,12 @@ def _start(context: LaunchContext) -> list[Node]:
     # In this order: an argument counts more than the file. What was not given must not hide what the file says.
     parameters: list[str | dict[str, Any]] = []
     if given("params_file"):
-        parameters.append(given("params_file"))
+        # launch_ros itself would leave out a file that is not there, and start the node with no limits.
+        parameters.append(existing_file("params_file", given("params_file")))
     if given("frame_file"):
         # Without its type, the name of a frame that looks like a number would become one.
-        parameters.append({"frame_file": ParameterValue(given("frame_file"), value_type=str)})
+        frame_file = ParameterValue(expanded("frame_file", given("frame_file")), value_type=str)
+        parameters.append({"frame_file": frame_file})
     if given("publish_tf"):
         parameters.append({"publish_tf": given("publish_tf") == "true"})
     return [

@@ -1,7 +1,8 @@
-"""A registered slice as a picture: what was found, which rod it is, and how well it fits."""
+"""A registered slice as a picture: what was found, which rod of which frame it is, and how well it fits."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import cv2
@@ -23,30 +24,48 @@ _BLUE: Final = (255, 170, 60)
 _WHITE: Final = (240, 240, 240)
 _LEAST_WIDTH = 1024
 _MOST_ROWS = 4096
-_HEADER = 64
+# For each frame two lines of text, above and below them a margin.
+_LINE = 26
+_MARGIN = 12
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 # Residuals are drawn so many times longer than they are: in a good registration they are a fraction of a pixel.
 _RESIDUAL_MAGNIFICATION = 10
 
 
-def draw_overlay(ct_slice: Slice, result: Registration | Refusal) -> Picture:
+def draw_overlay(ct_slice: Slice, results: Registration | Refusal | Sequence[Registration | Refusal]) -> Picture:
     """The slice in BGR (rows, columns, 3), enlarged to 1024 columns unless it is very tall, under the outcome in words.
 
-    Spots: yellow circles. Rods with a spot: green, with the rod's name and distance; the red stroke is the residual,
-    ten times enlarged. Rods that should be seen and have no spot: blue crosses. A refusal shows its best explanation.
+    results: one, or those of several frames that were sought in the slice: each has two lines of words, and the labels
+    name the frame. Spots that are no frame's rod: yellow circles. Rods with a spot: green, with the rod's name and
+    distance; the red stroke is the residual, ten times enlarged. Rods that should be seen and have no spot: blue
+    crosses. A refusal shows its best explanation. Raises ValueError where there is no result.
     """
-    best = result.estimate if result else (result.estimates[0] if result.estimates else None)
+    shown = [results] if isinstance(results, (Registration, Refusal)) else list(results)
+    if not shown:
+        raise ValueError("found no result to draw, expected one at least")
     grey = _grey(ct_slice)
     # Wide enough to read, but a tall narrow image must not grow beyond bounds.
     zoom = max(1, min(-(-_LEAST_WIDTH // grey.shape[1]), _MOST_ROWS // grey.shape[0]))
     large = cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
     body = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
-    _annotate(body, zoom, ct_slice, result, best)
-    picture = np.zeros((body.shape[0] + _HEADER, body.shape[1], 3), dtype=np.uint8)
-    picture[_HEADER:] = body
-    for row, (text, colour) in enumerate(_headline(result, best)):
-        cv2.putText(picture, text, (12, 26 + 26 * row), _FONT, 0.6, colour, 1, cv2.LINE_AA)
+    for spot in np.concatenate([result.spots_px for result in shown]):
+        cv2.circle(body, _at(spot, zoom), _radius(zoom), _YELLOW, 1, cv2.LINE_AA)
+    # Over the spots that are rods; and what was accepted over what was not.
+    for result in sorted(shown, key=bool):
+        _mark_rods(body, zoom, ct_slice, result, f"{result.frame.name} " if len(shown) > 1 else "")
+    headlines = [_headline(result) for result in shown]
+    header = _MARGIN + 2 * _LINE * len(headlines)
+    picture = np.zeros((body.shape[0] + header, body.shape[1], 3), dtype=np.uint8)
+    picture[header:] = body
+    for number, headline in enumerate(headlines):
+        for row, (text, colour) in enumerate(headline, 2 * number):
+            cv2.putText(picture, text, (_MARGIN, _LINE + _LINE * row), _FONT, 0.6, colour, 1, cv2.LINE_AA)
     return picture
+
+
+def _best(result: Registration | Refusal) -> PoseEstimate | None:
+    """The estimate that is shown."""
+    return result.estimate if result else next(iter(result.estimates), None)
 
 
 def _grey(ct_slice: Slice) -> Picture:
@@ -57,7 +76,9 @@ def _grey(ct_slice: Slice) -> Picture:
     return grey
 
 
-def _headline(result: Registration | Refusal, best: PoseEstimate | None) -> list[tuple[str, tuple[int, int, int]]]:
+def _headline(result: Registration | Refusal) -> list[tuple[str, tuple[int, int, int]]]:
+    """One or two lines of words with their colours."""
+    best = _best(result)
     lines = len(result.frame)
     if result:
         first = (
@@ -77,23 +98,21 @@ def _headline(result: Registration | Refusal, best: PoseEstimate | None) -> list
     return [(first, colour), (second, _WHITE)]
 
 
-def _annotate(
-    picture: cv2.typing.MatLike,
-    zoom: int,
-    ct_slice: Slice,
-    result: Registration | Refusal,
-    best: PoseEstimate | None,
-) -> None:
-    def at(point_px: Array) -> tuple[int, int]:
-        # Pixel centres are integers; the enlarged pixel (0, 0) has its centre at (zoom - 1) / 2.
-        u, v = point_px * zoom + (zoom - 1) / 2
-        return round(float(np.clip(u, -1e4, 1e4))), round(float(np.clip(v, -1e4, 1e4)))
+def _at(point_px: Array, zoom: int) -> tuple[int, int]:
+    """Where a point of the slice lies in the enlarged one."""
+    # Pixel centres are integers; the enlarged pixel (0, 0) has its centre at (zoom - 1) / 2.
+    u, v = point_px * zoom + (zoom - 1) / 2
+    return round(float(np.clip(u, -1e4, 1e4))), round(float(np.clip(v, -1e4, 1e4)))
 
-    radius = max(4, round(3.5 * zoom))
-    matched = {match.spot for match in best.matches} if best else set()
-    for row, spot in enumerate(result.spots_px):
-        if row not in matched:
-            cv2.circle(picture, at(spot), radius, _YELLOW, 1, cv2.LINE_AA)
+
+def _radius(zoom: int) -> int:
+    return max(4, round(3.5 * zoom))
+
+
+def _mark_rods(
+    picture: cv2.typing.MatLike, zoom: int, ct_slice: Slice, result: Registration | Refusal, prefix: str
+) -> None:
+    best, radius = _best(result), _radius(zoom)
     if best is None:
         return
     predicted, cuts = project(result.frame, best.slice_from_frame, ct_slice.scale)
@@ -102,14 +121,16 @@ def _annotate(
         match = by_line.get(line)
         if match is None:
             if cuts.inside[line]:
-                cv2.drawMarker(picture, at(predicted[line]), _BLUE, cv2.MARKER_TILTED_CROSS, 2 * radius, 1, cv2.LINE_AA)
-                _label(picture, at(predicted[line]), radius, f"{name} missing", _BLUE)
+                place = _at(predicted[line], zoom)
+                cv2.drawMarker(picture, place, _BLUE, cv2.MARKER_TILTED_CROSS, 2 * radius, 1, cv2.LINE_AA)
+                _label(picture, place, radius, f"{prefix}{name} missing", _BLUE)
             continue
-        cv2.circle(picture, at(match.spot_px), radius, _GREEN, 1, cv2.LINE_AA)
-        cv2.drawMarker(picture, at(match.predicted_px), _GREEN, cv2.MARKER_CROSS, radius, 1, cv2.LINE_AA)
+        spot, predicted_spot = _at(match.spot_px, zoom), _at(match.predicted_px, zoom)
+        cv2.circle(picture, spot, radius, _GREEN, 1, cv2.LINE_AA)
+        cv2.drawMarker(picture, predicted_spot, _GREEN, cv2.MARKER_CROSS, radius, 1, cv2.LINE_AA)
         stroke = match.predicted_px + _RESIDUAL_MAGNIFICATION * (match.spot_px - match.predicted_px)
-        cv2.line(picture, at(match.predicted_px), at(stroke), _RED, 2, cv2.LINE_AA)
-        _label(picture, at(match.spot_px), radius, f"{name} {match.residual_mm:.2f} mm", _GREEN)
+        cv2.line(picture, predicted_spot, _at(stroke, zoom), _RED, 2, cv2.LINE_AA)
+        _label(picture, spot, radius, f"{prefix}{name} {match.residual_mm:.2f} mm", _GREEN)
 
 
 def _label(

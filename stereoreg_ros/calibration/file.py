@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -15,15 +13,13 @@ import numpy as np
 import yaml
 
 from stereoreg_ros.calibration.calibrate import Calibration
-from stereoreg_ros.files.bounded_yaml import MOST_BYTES, UnusableYamlError, compose, shown
+from stereoreg_ros.files.bounded_yaml import MOST_BYTES, UnusableYamlError, shown
 from stereoreg_ros.files.whole_file import read_whole, sync_folder, write_whole
+from stereoreg_ros.files.yaml_values import values_of
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.uncertainty import checked_scale_covariance
 
 _KIND: Final = "stereoreg_ros pixel scale"
-# More than a file of ours has anywhere.
-_DEEPEST: Final = 4
-_LONGEST_SCALAR: Final = 200
 _MOST_COUNTED: Final = 10**9
 # Of a pixel; also of a standard error, whose square then is a number.
 _LARGEST_MM: Final = 100.0
@@ -31,8 +27,6 @@ _LARGEST_MM: Final = 100.0
 _LARGEST_FACTOR: Final = 2.0
 # Two spacings that differ by less are the same one, as a share.
 _SAME: Final = 1e-6
-_TAG: Final = "tag:yaml.org,2002:"
-_WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 
 
 class CalibrationFileError(ValueError):
@@ -119,8 +113,7 @@ def remove_calibration(path: Path) -> None:
 def load_calibration(path: Path) -> CalibrationRecord | None:
     """What the file says; None where there is none. Raises CalibrationFileError where it cannot be used."""
     try:
-        root = compose(read_whole(path, MOST_BYTES))
-        content = None if root is None else _value_of(root, 0, set())
+        content = values_of(read_whole(path, MOST_BYTES))
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -151,62 +144,6 @@ def load_calibration(path: Path) -> CalibrationRecord | None:
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MOST_COUNTED:
             raise CalibrationFileError(f"{path}: {key} is {shown(repr(value))}, expected a number of 1 or more")
     return CalibrationRecord(scale, old, covariance, **counts, **texts)  # type: ignore[arg-type]
-
-
-def _whole(text: str) -> int:
-    if not _WHOLE.fullmatch(text):
-        raise ValueError
-    return int(text)
-
-
-def _real(text: str) -> float:
-    # Python spells infinity and NaN without the point.
-    return float(re.sub(r"\.(inf|nan)", r"\1", text.lower()))
-
-
-_SCALARS: Final[dict[str, Callable[[str], Any]]] = {
-    "str": str,
-    "int": _whole,
-    "float": _real,
-    "bool": lambda text: yaml.SafeLoader.bool_values[text.lower()],
-    "null": lambda _: None,
-}
-
-
-def _value_of(node: yaml.Node, level: int, seen: set[int]) -> Any:
-    """What a node says: a mapping with texts as keys, a list, a text, a number, true or false, or nothing.
-
-    PyYAML's own constructors let the second of two equal keys win and raise nearly anything on values that do not fit
-    their tags; aliases of aliases say more than any message could repeat.
-    """
-    line = node.start_mark.line + 1
-    kind = str(node.tag).removeprefix(_TAG)
-    if level > _DEEPEST:
-        raise UnusableYamlError(f"is nested more than {_DEEPEST} levels deep, expected fewer", line)
-    if id(node) in seen:
-        raise UnusableYamlError("repeats a value by an alias, expected none", line)
-    seen.add(id(node))
-    if isinstance(node, yaml.MappingNode) and kind == "map":
-        entries: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            key = _value_of(key_node, level + 1, seen)
-            if not isinstance(key, str):
-                raise UnusableYamlError(f"a key is {shown(repr(key))}, expected a text", line)
-            if key in entries:
-                raise UnusableYamlError(f"key '{shown(key)}' comes a second time", line)
-            entries[key] = _value_of(value_node, level + 1, seen)
-        return entries
-    if isinstance(node, yaml.SequenceNode) and kind == "seq":
-        return [_value_of(one, level + 1, seen) for one in node.value]
-    convert = _SCALARS.get(kind)
-    if convert is None or not isinstance(node, yaml.ScalarNode):
-        raise UnusableYamlError(f"found a value of type {shown(kind)}, expected texts, numbers and lists", line)
-    if len(node.value) > _LONGEST_SCALAR:
-        raise UnusableYamlError(f"a value has {len(node.value)} characters, expected {_LONGEST_SCALAR} at most", line)
-    try:
-        return convert(node.value)
-    except (ValueError, KeyError):
-        raise UnusableYamlError(f"'{shown(node.value)}' is not of type {shown(kind)}", line) from None
 
 
 def _scale(path: Path, content: dict[str, Any], which: str) -> PixelScale:

@@ -47,7 +47,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
     def readable() -> Iterator[tuple[str, Slice]]:
         nonlocal unreadable
-        for path, ct_slice in slices_of(arguments.paths):
+        for path, ct_slice in slices_of(arguments.paths, slice_axes=arguments.slice_axes):
             if isinstance(ct_slice, DicomError):
                 unreadable += 1
                 complain(str(ct_slice))

@@ -28,7 +28,9 @@ from stereoreg_ros.registration import register_slice
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration, diagnostics
 from stereoreg_ros.worst_case import WorstCase, worst_case
 
-_TABLE_HEAD: Final = f"{'slice':{NAME_WIDTH}}  {'outcome':13}  {'rods':>8}  {'residual':>9}  position in the scanner"
+_TABLE_HEAD: Final = f"{'slice':{NAME_WIDTH}}  {'outcome':13}  {'rods':>8}  {'residual':>9}  position in "
+_SCANNER: Final = "the scanner"
+_SLICE: Final = "the slice's own axes"
 _LARGEST_SPOT_ERROR_PX: Final = 10.0
 
 
@@ -98,16 +100,19 @@ def _register(arguments: argparse.Namespace) -> int:
         raise WrongCallError(str(error)) from None
     pictures = _Pictures(arguments.overlay) if arguments.overlay is not None else None
     if not arguments.json:
-        print_line(_TABLE_HEAD)
+        print_line(_TABLE_HEAD + (_SLICE if arguments.slice_axes else _SCANNER))
     outcomes: Counter[str] = Counter()
-    for path, ct_slice in slices_of(arguments.paths):
+    for path, ct_slice in slices_of(arguments.paths, slice_axes=arguments.slice_axes):
         if isinstance(ct_slice, DicomError):
             outcome: _Registered | _Unreadable = _Unreadable(path, str(ct_slice))
             complain(str(ct_slice))
         else:
             scale = own_scale if arguments.pixel_spacing else replace(ct_slice.scale, shear=own_scale.shear)
             outcome = _timed(path, replace(ct_slice, scale=scale), frame, options, arguments.max_spot_error)
-        print_line(json.dumps(_record(outcome, frame), allow_nan=False) if arguments.json else _table_line(outcome))
+        if arguments.json:
+            print_line(json.dumps(_record(outcome, frame, slice_axes=arguments.slice_axes), allow_nan=False))
+        else:
+            print_line(_table_line(outcome))
         outcomes[_word(outcome)] += 1
         if pictures is not None and isinstance(outcome, _Registered):
             pictures.write(outcome)
@@ -140,7 +145,7 @@ def _word(outcome: _Registered | _Unreadable) -> str:
     return "accepted" if outcome.result else outcome.result.reason
 
 
-def _record(outcome: _Registered | _Unreadable, frame: Frame) -> dict[str, Any]:
+def _record(outcome: _Registered | _Unreadable, frame: Frame, *, slice_axes: bool) -> dict[str, Any]:
     """The JSON object of one slice: the same keys for every outcome, null for a number that does not exist."""
     record: dict[str, Any] = {"file": str(outcome.path)}
     if isinstance(outcome, _Unreadable):
@@ -157,6 +162,8 @@ def _record(outcome: _Registered | _Unreadable, frame: Frame) -> dict[str, Any]:
             record["caution"] = result.caution
         if outcome.max_spot_error_px is not None:
             record |= _worst_record(outcome.worst)
+    if slice_axes:
+        record["axes"] = "slice"
     record["scanner_from_frame"] = _pose_record(result.scanner_from_frame) if result else None
     record["matches"] = [_match_record(match) for match in result.matches] if result else []
     if not result and result.reason == "ambiguous":

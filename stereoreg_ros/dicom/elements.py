@@ -83,9 +83,12 @@ def tag_text(keyword: str) -> str:
     return f"{dictionary_description(tag)} ({tag >> 16:04X},{tag & 0xFFFF:04X})"
 
 
-def element_fault(file: Path, keyword: str, found: object, expected: str) -> DicomError:
-    """The error for an element that is missing (found: None) or not what is expected."""
-    state = "is missing" if found is None else f"is {_shortened(repr(found))}"
+def element_fault(file: Path, keyword: str, found: object, expected: str, *, quoted: bool = True) -> DicomError:
+    """The error for an element that is missing (found: None) or not what is expected.
+
+    quoted: as Python writes it; false for a name that stands for the value.
+    """
+    state = "is missing" if found is None else f"is {_shortened(repr(found) if quoted else str(found))}"
     return DicomError(file, f"{tag_text(keyword)} {state}, expected {expected}")
 
 

@@ -19,6 +19,7 @@ from stereoreg_ros.dicom.elements import (
     reading,
     tag_text,
 )
+from stereoreg_ros.dicom.scan_slice import require_scan_slice
 from stereoreg_ros.geometry.pose import Pose, nearest_rotation
 from stereoreg_ros.geometry.slice import PixelScale
 
@@ -33,7 +34,7 @@ class SliceHeader:
     """What a DICOM image says besides its pixels.
 
     path: the file. scale: mm/pixel. scanner_from_slice: plane of the slice in patient axes (LPS), mm; has_plane:
-    false where the file gives neither position nor orientation, and the pose is the identity.
+    false where the slice's own axes were asked for, and the pose is the identity, whatever the file says.
     rescale_slope, rescale_intercept: HU = stored value * slope + intercept. frame_of_reference_uid: of the axes, empty
     where the file has none.
     """
@@ -56,14 +57,20 @@ class SliceHeader:
         return float(self.scanner_from_slice.rotation[:, 2] @ self.scanner_from_slice.translation)
 
 
-def read_header(file: Path, dataset: pydicom.Dataset) -> SliceHeader:
-    """The header of an image of one grey frame; raises DicomError."""
+def read_header(file: Path, dataset: pydicom.Dataset, *, slice_axes: bool = False) -> SliceHeader:
+    """The header of an image of one grey frame; raises DicomError.
+
+    slice_axes: take any image for a slice, in its own axes; without, it must be a slice of a scan that says where it
+    lies (`require_scan_slice`).
+    """
     what = not_image(file, dataset)
     if what is not None:
-        raise DicomError(file, f"SOP Class UID (0008,0016) is {what}, expected a class of images")
+        raise element_fault(file, "SOPClassUID", what, "a class of images", quoted=False)
     _require_one_grey_frame(file, dataset)
+    if not slice_axes:
+        require_scan_slice(file, dataset)
     rows, columns = (element_integer(file, dataset, keyword, 1, MAX_SIDE_PX) for keyword in ("Rows", "Columns"))
-    scanner_from_slice = _read_plane(file, dataset)
+    scanner_from_slice = Pose.identity() if slice_axes else _read_plane(file, dataset)
     series_uid = element_value(file, dataset, "SeriesInstanceUID")
     if series_uid is None:
         raise element_fault(file, "SeriesInstanceUID", None, "the UID of the series")
@@ -78,8 +85,8 @@ def read_header(file: Path, dataset: pydicom.Dataset) -> SliceHeader:
         rows=rows,
         columns=columns,
         scale=_read_scale(file, dataset),
-        scanner_from_slice=scanner_from_slice or Pose.identity(),
-        has_plane=scanner_from_slice is not None,
+        scanner_from_slice=scanner_from_slice,
+        has_plane=not slice_axes,
         rescale_slope=slope,
         rescale_intercept=intercept,
         frame_of_reference_uid=str(element_value(file, dataset, "FrameOfReferenceUID") or ""),
@@ -119,11 +126,8 @@ def _read_scale(file: Path, dataset: pydicom.Dataset) -> PixelScale:
         ) from None
 
 
-def _read_plane(file: Path, dataset: pydicom.Dataset) -> Pose | None:
-    """scanner_from_slice, or None where the object gives neither position nor orientation."""
-    keywords = ("ImagePositionPatient", "ImageOrientationPatient")
-    if all(element_value(file, dataset, keyword) is None for keyword in keywords):
-        return None
+def _read_plane(file: Path, dataset: pydicom.Dataset) -> Pose:
+    """scanner_from_slice."""
     position = np.array(element_numbers(file, dataset, "ImagePositionPatient", 3))
     cosines = element_numbers(file, dataset, "ImageOrientationPatient", 6)
     x, y = np.array(cosines).reshape(2, 3)

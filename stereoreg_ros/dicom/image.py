@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pydicom
-from pydicom.uid import CTImageStorage, EnhancedCTImageStorage
+from pydicom.uid import EnhancedCTImageStorage
 
 from stereoreg_ros.dicom.dataset import parsed, read_dataset
 from stereoreg_ros.dicom.elements import DicomError, element_fault, element_integer, element_value, reading
@@ -25,21 +25,21 @@ class DicomSlice:
     ct_slice: Slice
 
 
-def read_slice(path: str | os.PathLike[str]) -> DicomSlice:
-    """Read one DICOM image with its pixels; DicomError where that is not possible."""
+def read_slice(path: str | os.PathLike[str], *, slice_axes: bool = False) -> DicomSlice:
+    """Read one DICOM image with its pixels; DicomError where that is not possible.
+
+    slice_axes: take any image for a slice, in its own axes: origin at the centre of pixel (0, 0), x along a row, y down
+    the rows. Without, it must be a slice of a scan that says where it lies.
+    """
     file = Path(path)
-    dataset = read_dataset(file, stop_before_pixels=False)
-    header = read_header(file, dataset)
-    return DicomSlice(header, Slice(read_hu(header, dataset), header.scale, header.scanner_from_slice))
+    return _slice_of(file, read_dataset(file, stop_before_pixels=False), slice_axes=slice_axes)
 
 
 def read_frames(name: Path, content: bytes, max_bytes: int, uid: str = "") -> tuple[DicomSlice, ...]:
     """The slices of a DICOM object in memory, in the form of a file: one, or every frame of an Enhanced CT image.
 
-    Meant for what arrives unasked, and stricter than `read_slice`: every slice must say where it lies, CT must say how
-    values become HU, and projections (localizers) are no slices. name: stands for the object in errors.
-    max_bytes: most that its data or its pixels may take when unpacked. uid: the SOP Instance UID that it was announced
-    with; empty: none. Raises DicomError.
+    Meant for what arrives unasked. name: stands for the object in errors. max_bytes: most that its data or its pixels
+    may take when unpacked. uid: the SOP Instance UID that it was announced with; empty: none. Raises DicomError.
     """
     dataset = parsed(name, content, max_bytes)
     if uid and str(element_value(name, dataset, "SOPInstanceUID")) != uid:
@@ -47,21 +47,15 @@ def read_frames(name: Path, content: bytes, max_bytes: int, uid: str = "") -> tu
             name, "SOPInstanceUID", element_value(name, dataset, "SOPInstanceUID"), f"{uid}, as announced"
         )
     _require_decoded_size(name, dataset, max_bytes)
-    _require_no_projection(name, dataset)
     frames = [dataset]
     if element_value(name, dataset, "SOPClassUID") == EnhancedCTImageStorage:
         with reading(name, "the frames of the Enhanced CT image cannot be told apart"):
             frames = single_frames(dataset)
-    return tuple(_read_placed(name, frame) for frame in frames)
+    return tuple(_slice_of(name, frame) for frame in frames)
 
 
-def _read_placed(name: Path, dataset: pydicom.Dataset) -> DicomSlice:
-    header = read_header(name, dataset)
-    if not header.has_plane:
-        raise element_fault(name, "ImagePositionPatient", None, "the position of the slice")
-    is_ct = element_value(name, dataset, "SOPClassUID") in (CTImageStorage, EnhancedCTImageStorage)
-    if is_ct and element_value(name, dataset, "RescaleSlope") is None:
-        raise element_fault(name, "RescaleSlope", None, "that of a CT image")
+def _slice_of(file: Path, dataset: pydicom.Dataset, *, slice_axes: bool = False) -> DicomSlice:
+    header = read_header(file, dataset, slice_axes=slice_axes)
     return DicomSlice(header, Slice(read_hu(header, dataset), header.scale, header.scanner_from_slice))
 
 
@@ -75,12 +69,3 @@ def _require_decoded_size(name: Path, dataset: pydicom.Dataset, max_bytes: int) 
     size = rows * columns * frames * allocated // 8
     if size > max_bytes:
         raise DicomError(name, f"its pixels take {size} bytes, expected {max_bytes} at most")
-
-
-def _require_no_projection(name: Path, dataset: pydicom.Dataset) -> None:
-    image_type = element_value(name, dataset, "ImageType") or ()
-    if "LOCALIZER" in image_type:
-        raise element_fault(name, "ImageType", list(image_type), "a slice")
-    volume = element_value(name, dataset, "VolumetricProperties")
-    if volume not in (None, "VOLUME"):
-        raise element_fault(name, "VolumetricProperties", volume, "VOLUME")

@@ -113,7 +113,21 @@ def _padding(file: Path, dataset: pydicom.Dataset, stored: NDArray[Any]) -> NDAr
 
 
 def _padding_value(file: Path, dataset: pydicom.Dataset, keyword: str) -> int:
+    """The element's value as a stored one: signed or not as the pixels are, and within the bits that count.
+
+    Many scanners write the padding of signed pixels as an unsigned number of 16 bits, whichever number of bits the
+    pixels have: -2000 as 63536 (0xF830).
+    """
     value = element_integer(file, dataset, keyword, -(2**31), 2**32 - 1)
-    bits = int(dataset.BitsStored)
-    # Many scanners write the padding of signed pixels as an unsigned number.
-    return value - 2**bits if int(dataset.PixelRepresentation) == 1 and value >= 2 ** (bits - 1) else value
+    signed = int(dataset.PixelRepresentation) == 1
+    value = _wrapped(value, 16, signed) if -(2**15) <= value < 2**16 else value
+    allocated, bits = int(dataset.BitsAllocated), int(dataset.BitsStored)
+    # No pixel has what does not fit into it.
+    return _wrapped(value, bits, signed) if -(2 ** (allocated - 1)) <= value < 2**allocated else value
+
+
+def _wrapped(value: int, bits: int, signed: bool) -> int:
+    """The lowest bits of a number, read as a signed or an unsigned one."""
+    count: int = 1 << bits
+    lowest = value % count
+    return lowest - count if signed and 2 * lowest >= count else lowest

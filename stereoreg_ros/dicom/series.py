@@ -34,29 +34,38 @@ class Skipped:
 class DicomSeries:
     """The slices of one series in table order, which is along the normal of the slices.
 
-    headers: of every slice; skipped: what else lies in the folder. Iteration reads the pixels, slice by slice.
+    headers: of every slice; skipped: what else lies in the folder; slice_axes: whether each slice is in its own axes,
+    and the order that of their instance numbers. Iteration reads the pixels, slice by slice.
     """
 
     headers: tuple[SliceHeader, ...]
     skipped: tuple[Skipped, ...] = ()
+    slice_axes: bool = False
 
     def __len__(self) -> int:
         return len(self.headers)
 
     def __iter__(self) -> Iterator[DicomSlice]:
-        return (read_slice(header.path) for header in self.headers)
+        return (read_slice(header.path, slice_axes=self.slice_axes) for header in self.headers)
 
 
-def read_series(path: str | os.PathLike[str], on_fault: Callable[[DicomError], None] | None = None) -> DicomSeries:
+def read_series(
+    path: str | os.PathLike[str],
+    on_fault: Callable[[DicomError], None] | None = None,
+    *,
+    slice_axes: bool = False,
+) -> DicomSeries:
     """Read the headers of one series: a DICOM file, or a folder (without its subfolders).
 
     What is no image (structure sets, plans, files that are not DICOM) is skipped and listed in the result.
     on_fault: called for an image with a fault, which is then left out; by default the fault is raised.
+    slice_axes: take every image for a slice in its own axes, as `read_slice` does, wherever it lies.
     Raises DicomError for a faulty image, and where the images are not one series of parallel slices.
     """
     folder = Path(path)
     if not_dicom(folder) != FOLDER:
-        return DicomSeries((read_header(folder, read_dataset(folder, stop_before_pixels=True)),))
+        header = read_header(folder, read_dataset(folder, stop_before_pixels=True), slice_axes=slice_axes)
+        return DicomSeries((header,), slice_axes=slice_axes)
     headers: list[SliceHeader] = []
     skipped: list[Skipped] = []
     faults = 0
@@ -67,7 +76,7 @@ def read_series(path: str | os.PathLike[str], on_fault: Callable[[DicomError], N
                 dataset = read_dataset(file, stop_before_pixels=True)
                 what = not_image(file, dataset)
                 if what is None:
-                    headers.append(read_header(file, dataset))
+                    headers.append(read_header(file, dataset, slice_axes=slice_axes))
         except DicomError as fault:
             if on_fault is None:
                 raise
@@ -80,8 +89,9 @@ def read_series(path: str | os.PathLike[str], on_fault: Callable[[DicomError], N
         raise DicomError(folder, f"holds no DICOM image among {len(skipped)} entries, expected a DICOM file or folder")
     _require_one_series(folder, headers)
     headers.sort(key=_order)
-    _require_distinct(folder, headers)
-    return DicomSeries(tuple(headers), tuple(skipped))
+    if not slice_axes:
+        _require_distinct(folder, headers)
+    return DicomSeries(tuple(headers), tuple(skipped), slice_axes)
 
 
 def _listed(folder: Path) -> list[Path]:
@@ -98,8 +108,6 @@ def _require_one_series(folder: Path, headers: list[SliceHeader]) -> None:
         raise DicomError(folder, f"holds {len(counts)} series, expected one (0020,000E): {series}")
     for header in headers:
         first = headers[0]
-        if len(headers) > 1 and not header.has_plane:
-            raise element_fault(header.path, "ImagePositionPatient", None, f"one for each of the {len(headers)} slices")
         turned = header.scanner_from_slice.rotation - first.scanner_from_slice.rotation
         if np.abs(turned).max() > AXES_TOLERANCE:
             raise _differs(header, first, "ImageOrientationPatient", _axes(header), _axes(first))

@@ -13,6 +13,8 @@ from stereoreg_ros.geometry.pose import Array, Pose
 
 # No scanner's values are larger, whatever they stand for; the squares of larger ones would not fit float32.
 LARGEST_HU: Final = 1e9
+# mm/pixel, smallest and largest that can be meant.
+SPACING_RANGE_MM: Final = (0.001, 100.0)
 
 
 @dataclass(frozen=True)

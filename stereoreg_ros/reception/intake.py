@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Final
 
 from stereoreg_ros.dicom import DicomError, read_frames
+from stereoreg_ros.geometry.slice import SPACING_RANGE_MM
 from stereoreg_ros.reception.kept_objects import KeptObjects
 from stereoreg_ros.reception.slice_queue import QueueFullError, ReceivedSlice, SliceQueue
 
 # Of the storage service, PS3.4 B.2.3.
 OUT_OF_RESOURCES: Final = 0xA700
 CANNOT_UNDERSTAND: Final = 0xC000
-
-# What register_node takes: a slice of another spacing would be in the way of all that follow.
-_SPACING_RANGE_MM: Final = (0.001, 100.0)
 
 
 class ObjectRefusedError(Exception):
@@ -53,7 +51,8 @@ class Intake:
             frames = read_frames(name, content, self._max_object_bytes, uid)
         except DicomError as error:
             raise ObjectRefusedError(CANNOT_UNDERSTAND, str(error)) from None
-        low, high = _SPACING_RANGE_MM
+        # What register_node takes: a slice of another spacing would be in the way of all that follow.
+        low, high = SPACING_RANGE_MM
         for frame in frames:
             scale = frame.header.scale
             if not (low <= scale.sx <= high and low <= scale.sy <= high):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import threading
 from itertools import count
 from pathlib import Path
 from typing import Final
 
+from stereoreg_ros.files.whole_file import remove_unfinished, sync_folder, write_whole
+
 _UID: Final = re.compile(r"[0-9]+(\.[0-9]+)*")
-_UNFINISHED: Final = ".part"
 
 
 def is_uid(text: str) -> bool:
@@ -38,38 +38,17 @@ class KeptObjects:
             for number in count(1):
                 file = self._folder / (f"{uid}.dcm" if number == 1 else f"{uid}_{number}.dcm")
                 if not os.path.lexists(file):
-                    self._write(file, content)
-                elif not _holds(file, content):
-                    continue
-                # Also where it was there already: the crash may have come before this step.
-                _sync_folder(self._folder)
-                return file
+                    write_whole(file, content)
+                    return file
+                if _holds(file, content):
+                    # A crash may have come before this step.
+                    sync_folder(self._folder)
+                    return file
         raise AssertionError("count does not end")
 
     def remove_unfinished(self) -> None:
         """Remove what a crash left half written; nobody was told that it was kept."""
-        for file in self._folder.glob(f".*{_UNFINISHED}"):
-            file.unlink(missing_ok=True)
-
-    def _write(self, file: Path, content: bytes) -> None:
-        unfinished = self._folder / f".{file.name}.{secrets.token_hex(4)}{_UNFINISHED}"
-        try:
-            with unfinished.open("xb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-            unfinished.rename(file)
-        except BaseException:
-            unfinished.unlink(missing_ok=True)
-            raise
-
-
-def _sync_folder(path: Path) -> None:
-    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+        remove_unfinished(self._folder)
 
 
 def _holds(file: Path, content: bytes) -> bool:

@@ -23,6 +23,7 @@ from stereoreg_ros.calibration.file import (
 )
 from stereoreg_ros.geometry.slice import PixelScale
 from support.calibration_records import RECORD, content
+from support.dicom_files import ROOT
 
 KILLS = 100
 # One process that makes others, which write until they are killed: to start Python for each would take minutes.
@@ -113,8 +114,10 @@ def test_killed_while_it_writes_the_file_is_the_old_or_the_new_one(tmp_path: Pat
     rng = random.Random(3)
     found, highest = 0, 0
     command = [sys.executable, "-W", "ignore", "-c", WRITERS, str(path)]
+    # The code under test, wherever another copy may be installed.
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "test")])}
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[1]
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as writers:
         assert writers.stdin is not None
         assert writers.stdout is not None

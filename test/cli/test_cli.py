@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pydicom.uid import CTImageStorage, DigitalXRayImageStorageForPresentation
 
 from stereoreg_ros import cli, load_frame
 from stereoreg_ros.geometry.pose import Pose, rotation_angle, rotation_exp
@@ -37,12 +38,17 @@ LEKSELL_PRIOR = ["--threshold", "1000", "--nominal-orientation", "0", "0", "0", 
 
 
 @pytest.fixture(scope="session")
-def cube_slice(tmp_path_factory):
-    """A DICOM slice of the shipped cube at SLICE_FROM_FRAME."""
+def cube_hu():
+    """HU of a slice of the shipped cube at SLICE_FROM_FRAME."""
     settings = ScannerSettings(shape=(220, 230), scale=SCALE, body=False)
     placed = PlacedFrame(load_frame("cube6"), SLICE_FROM_FRAME)
-    ct_slice = render_slice([placed], settings, np.random.default_rng(1))
-    return write_hu(tmp_path_factory.mktemp("cube") / "cube.dcm", ct_slice.hu)
+    return render_slice([placed], settings, np.random.default_rng(1)).hu
+
+
+@pytest.fixture(scope="session")
+def cube_slice(tmp_path_factory, cube_hu):
+    """That slice as a DICOM file."""
+    return write_hu(tmp_path_factory.mktemp("cube") / "cube.dcm", cube_hu)
 
 
 def write_hu(path: Path, hu: np.ndarray, **elements) -> Path:
@@ -154,6 +160,51 @@ def test_refused_slice_as_json(stereoreg, tmp_path):
     assert (found["outcome"], found["reason"]) == ("refused", "too_few_spots")
     assert "0 spots" in found["message"]
     assert (found["scanner_from_frame"], found["matches"], found["residual_rms_mm"]) == (None, [], None)
+
+
+NO_PLANE = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
+
+
+@pytest.mark.parametrize("sop_class", [CTImageStorage, DigitalXRayImageStorageForPresentation])
+def test_what_lies_nowhere_in_the_scanner_has_a_pose_in_its_own_axes_only_where_that_is_asked_for(
+    stereoreg, tmp_path, cube_hu, sop_class
+):
+    path = write_hu(tmp_path / "a.dcm", cube_hu, SOPClassUID=sop_class, **NO_PLANE)
+    call = ["register", "--frame", "cube6", *CUBE_PRIOR, path]
+    code, output, errors = stereoreg(*call, "--json")
+    assert code == 1
+    (found,) = objects(output)
+    assert (found["outcome"], found["reason"], found["scanner_from_frame"]) == ("refused", "bad_image", None)
+    assert "ask for poses in the slice's own axes: --slice-axes" in found["message"]
+    assert "axes" not in found
+    assert errors == f"stereoreg: {found['message']}\n"
+    code, output, errors = stereoreg(*call, "--json", "--slice-axes")
+    assert (code, errors) == (0, "")
+    (found,) = objects(output)
+    assert list(found) == ["file", *DIAGNOSTIC_KEYS, "axes", "scanner_from_frame", "matches"]
+    assert (found["outcome"], found["axes"]) == ("accepted", "slice")
+    position = found["scanner_from_frame"]["position_mm"]
+    np.testing.assert_allclose(position, SLICE_FROM_FRAME.translation, atol=0.5)
+    head = stereoreg(*call, "--slice-axes")[1].splitlines()[0]
+    assert head.endswith("  residual  position in the slice's own axes")
+
+
+def test_in_the_slices_own_axes_a_plane_does_not_count(stereoreg, cube_slice):
+    call = ["register", "--frame", "cube6", *CUBE_PRIOR, "--json", "--slice-axes", cube_slice]
+    (found,) = objects(stereoreg(*call)[1])
+    position = found["scanner_from_frame"]["position_mm"]
+    np.testing.assert_allclose(position, SLICE_FROM_FRAME.translation, atol=0.5)
+
+
+def test_a_localizer_in_a_series_is_refused_and_the_slices_are_registered(stereoreg, tmp_path, cube_slice):
+    (tmp_path / "slice.dcm").write_bytes(cube_slice.read_bytes())
+    write_slice(tmp_path / "scout.dcm", np.zeros((8, 8)), 5.0, ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"])
+    code, output, _ = stereoreg("register", "--frame", "cube6", *CUBE_PRIOR, "--json", tmp_path)
+    assert code == 1
+    assert {Path(one["file"]).name: one["reason"] for one in objects(output)} == {
+        "slice.dcm": "",
+        "scout.dcm": "bad_image",
+    }
 
 
 def test_bad_files_among_good_ones(stereoreg, cube_slice, tmp_path):

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from benchmarks.clutter import THRESHOLDS, Clutter, count
+from support.clutter_counts import THRESHOLDS, Clutter, count
 
 
 @pytest.mark.parametrize(

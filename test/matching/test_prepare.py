@@ -10,7 +10,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.matching import by_levels
 from stereoreg_ros.registration import prepare
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
-from stereoreg_ros.solvers import three_lines
+from stereoreg_ros.solvers import three_rods
 
 FRAME, SCANNER = load_frame("cube6"), ScannerSettings(false_spots=24)
 
@@ -30,7 +30,7 @@ def assert_no_slice_waits_for_a_table(monkeypatch, frame: Frame, options: Regist
     def missed(*_: object) -> None:
         raise AssertionError("a table was not prepared")
 
-    monkeypatch.setattr(three_lines._Table, "of", missed)
+    monkeypatch.setattr(three_rods._Table, "of", missed)
     seen = register_slice(with_frame, frame, options)
     assert seen
     gone = register_slice(without_frame, frame, options, previous=seen.scanner_from_frame)
@@ -46,24 +46,21 @@ def test_once_prepared_no_slice_waits_for_a_table(no_tables, monkeypatch, noise_
     assert_no_slice_waits_for_a_table(monkeypatch, FRAME, options)
 
 
-def test_the_node_goes_on_preparing_in_its_spare_time(no_tables, monkeypatch):
+def test_the_node_goes_on_preparing_while_no_slice_comes(no_tables, monkeypatch):
     rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not there")
-    from rclpy.parameter import Parameter
 
     from stereoreg_ros.nodes.register import register_node
     from support.ros_process import node_here
 
-    monkeypatch.setattr(register_node, "_PREPARE_S", 0.0)
-    monkeypatch.setattr(register_node, "_SPARE_TIME_S", 0.01)
+    monkeypatch.setattr(register_node, "_PREPARE_AT_START_S", 0.0)
+    monkeypatch.setattr(register_node, "_PREPARE_AT_ONCE_S", 0.0)
     with node_here(register_node.RegisterNode) as node:
-        scale = SCANNER.scale
-        node.set_parameters([Parameter("pixel_spacing", value=[scale.sx, scale.sy])])
         few = by_levels._solver.cache_info().currsize
-        for _ in range(1000):
-            if node._spare_time.is_canceled():
+        for _ in range(10000):
+            if node._preparation is None:
                 break
             rclpy.spin_once(node, timeout_sec=0.1)
+        (output,) = node._outputs
     assert few < by_levels._solver.cache_info().currsize
     # Tables are of one frame, as it was loaded.
-    assert node.frame is not None
-    assert_no_slice_waits_for_a_table(monkeypatch, node.frame, RegistrationOptions())
+    assert_no_slice_waits_for_a_table(monkeypatch, output.frame, RegistrationOptions())

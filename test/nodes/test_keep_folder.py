@@ -118,18 +118,18 @@ def test_a_full_disk_leaves_nothing_half_written(folder, monkeypatch):
 
 def test_every_step_is_synced_in_its_turn(folder, monkeypatch):
     steps = []
-    real_fsync, real_rename = os.fsync, Path.rename
+    real_fsync, real_replace = os.fsync, os.replace
 
     def fsync(descriptor: int) -> None:
         steps.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file")
         real_fsync(descriptor)
 
-    def rename(path: Path, target: Path) -> Path:
+    def replace(path: Path, target: Path) -> None:
         steps.append("rename")
-        return real_rename(path, target)
+        real_replace(path, target)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(Path, "rename", rename)
+    monkeypatch.setattr(os, "replace", replace)
     kept = KeptObjects(folder)
     assert kept.keep("1.2.3", b"content").read_bytes() == b"content"
     assert steps == ["file", "rename", "folder"]

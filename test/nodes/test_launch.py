@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,7 +17,7 @@ import yaml
 pytest.importorskip("rclpy", reason="ROS 2 is not there")
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
@@ -48,7 +49,7 @@ def test_executables_are_installed_and_arguments_described(path):
     ours = [text_of(node["executable"]) for node in started if text_of(node["package"]) == PACKAGE]
     assert ours
     for executable in ours:
-        assert f'"{executable} = {PACKAGE}.nodes.{executable}:main"' in setup
+        assert re.search(rf'"{executable} = {PACKAGE}\.nodes\.\w+\.{executable}:main"', setup)
     declared = {text_of(call.args[0]): call for call in calls(tree, "DeclareLaunchArgument")}
     assert set(declared) >= ARGUMENTS
     for call in declared.values():
@@ -63,6 +64,28 @@ def has_launch() -> bool:
         return bool(get_package_prefix(PACKAGE))
     except PackageNotFoundError:
         return False
+
+
+def test_a_parameter_file_is_checked_and_paths_are_expanded_before_anything_is_started():
+    """With what, test_given_path.py shows; here, that nothing goes round it."""
+    register, demo = (ast.parse(path.read_text()) for path in FILES)
+    (checked,) = calls(register, "existing_file")
+    assert text_of(checked.args[0]) == "params_file"
+    # The demonstration has register.launch.py look at its own.
+    assert calls(demo, "IncludeLaunchDescription")
+    for tree in (register, demo):
+        assert [text_of(call.args[0]) for call in calls(tree, "expanded")] == ["frame_file"]
+
+
+@pytest.mark.skipif(not has_launch(), reason="needs ros2 launch and this package in a sourced workspace")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_nothing_is_started_without_the_parameter_file_that_was_named(tmp_path, path):
+    command = ["ros2", "launch", str(path), f"params_file:={tmp_path / 'nowhere.yaml'}"]
+    environment = {**os.environ, **ROS_ENVIRONMENT}
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert ran.returncode != 0
+    assert "nowhere.yaml: no such file; nothing is started" in ran.stdout + ran.stderr
+    assert "process started" not in ran.stdout + ran.stderr
 
 
 @pytest.mark.skipif(not has_launch(), reason="needs ros2 launch and this package in a sourced workspace")
@@ -91,7 +114,12 @@ def test_demo_registers_slices(tmp_path):
             assert np.linalg.norm(found.translation - true.translation) < 1.5
             # An argument counts more than the file, which counts for all else.
             assert pose.header.frame_id == "from_the_file"
-            status = client.wait_for(lambda: diagnostics, "diagnostics")[0].status[0]
+
+            def registrations() -> list[DiagnosticStatus]:
+                statuses = [status for array in diagnostics for status in array.status]
+                return [status for status in statuses if status.name.endswith("register_node: registration")]
+
+            status = client.wait_for(registrations, "diagnostics of a slice")[0]
             assert {pair.key: pair.value for pair in status.values}["frame"] == "cube6"
             process.send_signal(signal.SIGINT)
             assert process.wait(30) == 0, log.read_text()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,12 +65,29 @@ def test_hu_that_are_not_whole_are_played_as_floats(client, tmp_path):
     np.testing.assert_array_equal(pixels(images[0]), IMAGE * 0.5 - 1024)
 
 
-def test_slice_without_plane_has_no_slice_pose(client, tmp_path):
-    path = write_slice(tmp_path / "a.dcm", IMAGE, ImagePositionPatient=None, ImageOrientationPatient=None)
-    with play(path) as player:
+NO_PLANE: dict[str, Any] = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
+
+
+def test_a_slice_without_a_plane_is_refused(tmp_path):
+    with play(write_slice(tmp_path / "a.dcm", IMAGE, **NO_PLANE)) as player:
+        assert player.wait() == 1
+        assert "Image Position (Patient) (0020,0032) is missing, expected the position of the slice" in player.output
+        assert "slice_axes of play_dicom_node" in player.output
+        assert "Traceback" not in player.output
+
+
+@pytest.mark.parametrize(("named", "published"), [({}, "ct_slice"), ({"frame_id": "phantom"}, "phantom")])
+def test_slices_in_their_own_axes_have_no_slice_pose_and_another_frame_id(client, tmp_path, named, published):
+    write_slice(tmp_path / "a.dcm", IMAGE, InstanceNumber=1, **NO_PLANE)
+    write_slice(tmp_path / "b.dcm", IMAGE + 1, InstanceNumber=2)
+    with play(tmp_path, slice_axes=True, **named) as player:
         poses, images = client.collect(PoseStamped, "slice_pose"), client.collect(Image, "image")
-        client.wait_for(lambda: images, "the slice")
-        assert "no slice_pose" in player.output
+        client.wait_for(lambda: len(images) == 2, "two slices")
+        assert player.wait() == 0
+        assert f"each slice is in its own axes, '{published}': no slice_pose" in player.output
+    assert [int(pixels(image)[0, 0]) + 1024 for image in images] == [0, 1]
+    assert {image.header.frame_id for image in images} == {published}
+    # The poses are published before the images.
     assert not poses
 
 
@@ -163,7 +181,7 @@ def test_it_does_not_start_on_mixed_series(series):
 
 
 def test_parameters_are_described(client, series):
-    names = ["path", "rate", "loop", "frame_id", "register_node", "wait_for_subscriber"]
+    names = ["path", "rate", "loop", "frame_id", "slice_axes", "register_node", "wait_for_subscriber"]
     with play(series):
         described = client.describe_parameters("play_dicom_node", *names)
     assert all(one.description for one in described)

@@ -270,6 +270,23 @@ def test_pictures_while_subscribed(bench):
     bench.accept(image_of(hu))
 
 
+def test_the_overlay_shows_every_frame(bench):
+    """Each has its two lines of words above the slice, of 26 pixels each."""
+    assert bench.set(frame_files=["cube6", "leksell_ct", "zframe"]) == ""
+    hu, _ = rendered(9)
+    with RosClient("viewer") as viewer:
+        overlays = viewer.collect(Image, "/overlay")
+
+        def delivered() -> bool:
+            if not overlays:
+                stamp = bench.send(image_of(hu))
+                bench.client.wait_for(lambda: of_stamp(bench.diagnostics, stamp), "the diagnostics of a slice")
+            return bool(overlays)
+
+        viewer.wait_for(delivered, "the overlay")
+    assert (overlays[-1].height, overlays[-1].width) == (4 * 256 + 12 + 3 * 52, 1024)
+
+
 def test_target_in_frame(bench):
     hu, _ = rendered(10)
     target = np.array([30.0, -20.0, 12.0])

@@ -25,7 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "uncertainty": {"geometry"},
     "simulation": {"geometry"},
     "dicom": {"files", "geometry"},
-    "reception": {"geometry", "dicom"},
+    "reception": {"files", "geometry", "dicom"},
     "matching": {"geometry", "options", "solvers"},
     "result": {"geometry", "options", "uncertainty"},
     "judgement": {"geometry", "options", "matching", "result"},
@@ -112,3 +112,30 @@ def test_the_core_runs_without_ros() -> None:
     assert set(core) <= set(loaded)
     assert not [module for module in loaded if is_ros(module)]
     assert not [module for module in loaded if module.startswith("stereoreg_ros.nodes")]
+
+
+REPOSITORY = PACKAGE.parent
+TESTS = sorted((REPOSITORY / "test").rglob("*.py"))
+PROGRAMS = ("benchmarks", "fuzzing", "mutants")
+
+
+def within(path: Path) -> str:
+    return path.relative_to(REPOSITORY).as_posix()
+
+
+@pytest.mark.parametrize("path", TESTS, ids=within)
+def test_tests_share_code_through_support_alone(path: Path) -> None:
+    """Not through benchmarks, and not through another test: what two of them need lies in test/support."""
+    tests = {other.stem for other in TESTS if other.stem.startswith("test_")}
+    assert not {module for module in imported(path) if module.split(".")[0] in {"benchmarks", "test", *tests}}
+
+
+@pytest.mark.parametrize(
+    "path", [path for name in PROGRAMS for path in sorted((REPOSITORY / name).rglob("*.py"))], ids=within
+)
+def test_programs_beside_the_tests_share_code_through_support_alone(path: Path) -> None:
+    """Found as an installed module is: nothing is put into the path where it runs."""
+    assert "sys.path" not in path.read_text(encoding="utf-8")
+    others = set(PROGRAMS) - {path.relative_to(REPOSITORY).parts[0]}
+    tests = {other.stem for other in TESTS if other.stem.startswith("test_")}
+    assert not {module for module in imported(path) if module.split(".")[0] in {"test", *others, *tests}}

@@ -16,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stereoreg_ros.dicom import read_slice
+from stereoreg_ros.files.whole_file import write_whole
 from stereoreg_ros.reception.bounded_socket import Limits
 from stereoreg_ros.reception.intake import Intake
 from stereoreg_ros.reception.kept_objects import KeptObjects
@@ -166,18 +167,17 @@ def test_of_two_associations_that_store_one_uid_at_once_neither_overwrites_what_
         patched.setattr(threading, "Lock", lambda: lock)
         kept = KeptObjects(folder)
     writing = threading.Semaphore(0)
-    real_write = KeptObjects._write
 
-    def write(self: KeptObjects, file: Path, content: bytes) -> None:
+    def write(file: Path, content: bytes) -> None:
         # The first to write goes on once the second is there too: it waits for the lock, or writes as well.
         if writing.acquire(blocking=False):
             lock.somebody_waits.set()
         else:
             writing.release()
         assert lock.somebody_waits.wait(PATIENCE_S)
-        real_write(self, file, content)
+        write_whole(file, content)
 
-    monkeypatch.setattr(KeptObjects, "_write", write)
+    monkeypatch.setattr("stereoreg_ros.reception.kept_objects.write_whole", write)
     with storage(SliceQueue(10), kept) as port, ThreadPoolExecutor(2) as clients:
         responses = list(clients.map(lambda path: send(port, path)[0].Status, paths))
     assert responses == [SUCCESS, SUCCESS]

@@ -192,3 +192,74 @@ class TestPicture:
         before = ct_slice.hu.copy()
         draw_overlay(ct_slice, accepted())
         np.testing.assert_array_equal(ct_slice.hu, before)
+
+
+class TestSeveralFrames:
+    """Two frames in one slice, of which the second was not offered all spots."""
+
+    ZOOM = 4
+    HEADER = 116
+
+    def results(self) -> tuple[Registration, Registration]:
+        first = accepted()
+        # The same rods, but for the first, moved by 60 x 50 pixels; its spots are counted from its own first.
+        pose = Pose(POSE.rotation, POSE.translation + np.array([30.0, 25.0, 0.0]))
+        estimate, spots = an_estimate(pose)
+        second = replace(FRAME, name="second")
+        return (
+            replace(first, spots_px=np.concatenate([first.spots_px, spots[: len(estimate.matches)]])),
+            Registration(second, SCALE, RegistrationOptions(), spots[:-1], estimate),
+        )
+
+    def near(self, picture: NDArray[np.uint8], colour: tuple[int, int, int], pixel: Array) -> int:
+        return count(picture[self.HEADER - HEADER :], colour, pixel, self.ZOOM)
+
+    @pytest.mark.parametrize("backwards", [False, True])
+    def test_rods_of_all_frames_are_shown_and_no_frames_rods_are_other_spots(self, backwards: bool) -> None:
+        first, second = self.results()
+        picture = draw_overlay(a_slice(), [second, first] if backwards else (first, second))
+        assert picture.shape == (256 * self.ZOOM + self.HEADER, 1024, 3)
+        for result in (first, second):
+            for match in result.matches:
+                assert self.near(picture, GREEN, match.spot_px) > 30
+                assert self.near(picture, RED, match.spot_px) > 10
+        for pose in (first.scanner_from_frame, second.scanner_from_frame):
+            assert self.near(picture, BLUE, project(FRAME, pose, SCALE)[0][MISSING]) > 30
+        for spot in FALSE_SPOTS:
+            assert self.near(picture, YELLOW, spot) > 30
+        alone = draw_overlay(a_slice(), first)
+        others = [match.spot_px for match in second.matches]
+        assert all(count(alone, YELLOW, spot, self.ZOOM) > 30 for spot in others)
+        # Letters of labels have other colours.
+        assert not any(self.near(picture, YELLOW, spot) for spot in others)
+
+    def test_each_has_its_own_headline(self) -> None:
+        first, second = self.results()
+        refused = Refusal(second.frame, SCALE, second.spots_px, "ambiguous", "two poses", (second.estimate,))
+        for one, other in ((first, refused), (refused, first)):
+            picture = draw_overlay(a_slice(), [one, other])
+            head = picture[: self.HEADER].astype(int)
+            for rows, result in ((slice(0, 34), one), (slice(58, 86), other)):
+                green, red = ((np.abs(head[rows] - c).max(axis=-1) <= 60).sum() for c in (GREEN, RED))
+                assert (green > 50, red > 50) == (bool(result), not result)
+
+    def test_labels_name_the_frame_where_there_are_several(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        labels: list[str] = []
+        monkeypatch.setattr(
+            "stereoreg_ros.drawing._label", lambda _picture, _place, _radius, text, _: labels.append(text)
+        )
+        first, second = self.results()
+        draw_overlay(a_slice(), [first, second])
+        assert f"cube6 {FRAME.line_names[MISSING]} missing" in labels
+        assert f"second {second.matches[0].line} {second.matches[0].residual_mm:.2f} mm" in labels
+        assert len(labels) == 2 * len(FRAME)
+        labels.clear()
+        draw_overlay(a_slice(), [first])
+        assert labels[0] == f"{first.matches[0].line} {first.matches[0].residual_mm:.2f} mm"
+
+    def test_one_result_in_a_list_is_drawn_as_by_itself(self) -> None:
+        np.testing.assert_array_equal(draw_overlay(a_slice(), [accepted()]), draw_overlay(a_slice(), accepted()))
+
+    def test_without_a_result_there_is_nothing_to_draw(self) -> None:
+        with pytest.raises(ValueError, match="found no result to draw"):
+            draw_overlay(a_slice(), [])

@@ -7,24 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.mistakes import (
-    CASES,
-    FRAMES,
-    KINDS,
-    LAYOUTS,
-    Outcome,
-    frame_named,
-    judge,
-    measure,
-    measure_cases,
-    plausibility,
-    register,
-    row_of,
-    scene_of,
-)
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.result import Registration
 from stereoreg_ros.simulation.mistakes import NO_ROD
+from support.mistake_scenes import CASES, FRAMES, KINDS, LAYOUTS, frame_named, register, scene_of
+from support.mistake_verdicts import Outcome, judge, measure, measure_cases, plausibility, row_of
 
 
 def accepted(kind: str, frame: str, index: int) -> Registration:

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.uncertainty import RENDERED_CASES, SPOT_CASES, WORST_CASES, Case, is_sound, measure, within_limits
 from stereoreg_ros import RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.simulation import ScannerSettings, random_pose
 from support.pose_statistics import PoseStatistics, pose_error
+from support.stated_errors import RENDERED_CASES, SPOT_CASES, WORST_CASES, Case, is_sound, measure, within_limits
 from support.worst_cases import count_worst_cases
 
 

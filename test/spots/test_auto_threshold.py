@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.spots import BESIDE, Beside, compare
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.dicom import DicomSlice, read_series
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
@@ -21,6 +20,7 @@ from stereoreg_ros.spots import FoundSpots, find_spots
 from stereoreg_ros.spots.choice import worth_matching
 from stereoreg_ros.spots.peaks import find_peaks
 from support.artefacts import measure as measure_scanned
+from support.beside_bright_things import BESIDE, Beside, compare
 from support.dicom_files import SHARED_DATA, real
 from support.real_images import catphan, height, leksell, shows_module, zframe
 

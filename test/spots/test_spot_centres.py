@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.spots import CASES, Case, measure
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.simulation import Cylinder, add_metal
 from stereoreg_ros.spots import FoundSpots, find_spots
 from support.artefacts import measure as measure_scanned
+from support.spot_accuracy import CASES, Case, measure
 
 TRIALS = 120
 SCALE = PixelScale(0.5, 0.5)

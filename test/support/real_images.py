@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.real_frames import Figures, rows_of, run
 from stereoreg_ros.dicom import DicomSlice, read_series, read_slice
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.options import RegistrationOptions
 from support.dicom_files import CATPHAN, SHARED_DATA, real
+from support.real_rows import Figures, rows_of, run
 from support.real_scenes import series_at
 
 # The box as it was mounted: its z axis against the slice normal, its y axis up the picture. Two plates leave the tilt

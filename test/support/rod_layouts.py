@@ -26,6 +26,19 @@ def well_conditioned_frame(rods: int, layouts: int = 60, seed: int = 0) -> Frame
     return min((frame for frame in drawn if frame is not None), key=weakness)
 
 
+def random_rods(rng: np.random.Generator, lines: int) -> Frame:
+    """Rods from the lower to the upper face of a cube of 60 mm, no two within 8 mm at an end."""
+    ends: list[Array] = []
+    while len(ends) < lines:
+        drawn = rng.uniform(-30, 30, (2, 2))
+        if all((np.linalg.norm(drawn - other, axis=1) > 8.0).all() for other in ends):
+            ends.append(drawn)
+    both = np.array(ends)
+    low, high = np.full((lines, 1), -30.0), np.full((lines, 1), 30.0)
+    names = tuple(f"r{k}" for k in range(lines))
+    return Frame("random", names, np.hstack([both[:, 0], low]), np.hstack([both[:, 1], high]), np.ones(lines))
+
+
 def best_subset(frame: Frame, subsets: list[tuple[int, ...]]) -> Frame:
     """The frame with only those of its rods, of the subsets given, that determine the pose best."""
     return min((subset(frame, rods) for rods in subsets), key=weakness)

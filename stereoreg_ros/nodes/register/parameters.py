@@ -10,11 +10,9 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.slice import SPACING_RANGE_MM, PixelScale
 from stereoreg_ros.nodes.common.parameters import ParameterError, declare, entries_of, plain, setting
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
-
-_SPACING_RANGE_MM = (0.001, 100.0)
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ class NodeSettings:
             value = getattr(self, entry.name)
             if entry.low is not None and entry.high is not None and not entry.low <= value <= entry.high:
                 raise ValueError(f"{entry.name} is {value!r}, expected a number from {entry.low:g} to {entry.high:g}")
-        low, high = _SPACING_RANGE_MM
+        low, high = SPACING_RANGE_MM
         if len(self.pixel_spacing) != 2:
             raise ValueError(f"pixel_spacing has {len(self.pixel_spacing)} numbers, expected two: [sx, sy] in mm/pixel")
         numbers = all(isinstance(spacing, float | int) for spacing in self.pixel_spacing)

@@ -38,7 +38,7 @@ class Pictures:
         overlay = markers = None
         try:
             if self._overlay.get_subscription_count() > 0:
-                overlay = image_from_bgr(draw_overlay(ct_slice, results[0][0]))
+                overlay = image_from_bgr(draw_overlay(ct_slice, [result for result, _ in results]))
                 overlay.header = header
             if self._markers.get_subscription_count() > 0:
                 markers = markers_of(ct_slice, results, header, target)

@@ -94,6 +94,7 @@ class RegisterNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._scale.load()
+        self._go_on()
         self.get_logger().info(f"ready, {self.settings.in_force}")
 
     def destroy_node(self) -> None:

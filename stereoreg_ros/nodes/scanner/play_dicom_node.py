@@ -14,12 +14,21 @@ from stereoreg_ros.nodes.common.slice_publisher import UNUSED_REGISTER_NODE, Sli
 
 FLUSH_S: Final = 10.0
 _POLL_S: Final = 0.02
+_SCANNER: Final = "scanner"
+# What the images' frame_id is in place of that: nobody must take the axes of one slice for the scanner's.
+_SLICE: Final = "ct_slice"
 
 ENTRIES: Final = (
     Entry("path", "", "DICOM file, or folder with the slices of one series"),
     Entry("rate", 1.0, "slices per second", 0.01, 100.0),
     Entry("loop", False, "start again after the last slice, for ever"),
-    Entry("frame_id", "scanner", "frame_id of the images and slice poses: the patient axes of the DICOM files"),
+    Entry("frame_id", _SCANNER, "frame_id of the images and slice poses: the patient axes of the DICOM files"),
+    Entry(
+        "slice_axes",
+        False,
+        "take every image for a slice in its own axes, also one without a plane: no slice_pose, "
+        f"and '{_SLICE}' as frame_id where it is left at '{_SCANNER}'",
+    ),
     UNUSED_REGISTER_NODE,
     Entry("wait_for_subscriber", True, "play nothing before somebody subscribes to image"),
 )
@@ -43,14 +52,16 @@ class PlayDicomNode(Node):
         if not values["path"]:
             raise ParameterError("parameter path is empty, expected a DICOM file or folder")
         try:
-            self._series = read_series(values["path"])
+            self._series = read_series(values["path"], slice_axes=values["slice_axes"])
         except DicomError as error:
             raise ParameterError(str(error)) from None
         for skipped in self._series.skipped:
             self.get_logger().info(f"skipped {skipped.path}: {skipped.what}")
-        if not self._series.headers[0].has_plane:
-            self.get_logger().warning(f"{values['path']} has no position and no orientation: no slice_pose")
-        self._publisher = SlicePublisher(self, values["frame_id"])
+        frame_id: str = values["frame_id"]
+        if self._series.slice_axes:
+            frame_id = _SLICE if frame_id == _SCANNER else frame_id
+            self.get_logger().warning(f"each slice is in its own axes, '{frame_id}': no slice_pose")
+        self._publisher = SlicePublisher(self, frame_id)
         self._next = 0
         self._due_s = 0.0
         self._flush_by_s: float | None = None
@@ -76,7 +87,7 @@ class PlayDicomNode(Node):
         path = self._series.headers[self._next].path
         try:
             stamp = self._publisher.unique_stamp(self.get_clock().now().nanoseconds)
-            self._publisher.publish(read_slice(path), stamp)
+            self._publisher.publish(read_slice(path, slice_axes=self._series.slice_axes), stamp)
         except DicomError as error:
             self.faults += 1
             self.get_logger().error(f"left out: {error}")
