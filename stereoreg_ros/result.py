@@ -195,34 +195,58 @@ class Refusal:
         return False
 
 
+# The diagnostic keys of the contract, in its order, of a slice in which nothing was found: a number that does not exist
+# is NaN.
+NOTHING_FOUND: Final[dict[str, str | int | float]] = {
+    "outcome": "refused",
+    "reason": "",
+    "frame": "",
+    "spots": 0,
+    "lines": 0,
+    "inliers": 0,
+    "residual_rms_mm": math.nan,
+    "residual_rms_px": math.nan,
+    "log10_false_alarms": math.nan,
+    "ambiguous_poses": 0,
+    "position_std_mm": math.nan,
+    "rotation_std_deg": math.nan,
+    "target_error_95_mm": math.nan,
+    "pixel_spacing_x_mm": math.nan,
+    "pixel_spacing_y_mm": math.nan,
+    "calibration": "configured",
+    "duration_ms": math.nan,
+}
+
+
 def diagnostics(result: Registration | Refusal, calibration: str, duration_s: float) -> dict[str, str | int | float]:
     """The diagnostic keys of the contract, in its order; a number that does not exist is NaN.
 
     calibration: `configured` or `measured`; duration_s: seconds spent on the slice.
     """
-    best: PoseEstimate | None
-    if result:
-        best, alternatives = result.estimate, 1
-    else:
-        best = result.estimates[0] if result.estimates else None
-        alternatives = len(result.estimates)
-    nan = math.nan
-    return {
-        "outcome": "accepted" if result else "refused",
-        "reason": "" if result else result.reason,
+    values = NOTHING_FOUND | {
         "frame": result.frame.name,
         "spots": len(result.spots_px),
         "lines": len(result.frame),
-        "inliers": best.inliers if best else 0,
-        "residual_rms_mm": best.residual_rms_mm if best else nan,
-        "residual_rms_px": best.residual_rms_px if best else nan,
-        "log10_false_alarms": best.log10_false_alarms if best else nan,
-        "ambiguous_poses": alternatives,
-        "position_std_mm": best.position_std_mm if best else nan,
-        "rotation_std_deg": best.rotation_std_deg if best else nan,
-        "target_error_95_mm": (best.target_error_95_mm(result.options.target_in_frame_mm) if best else nan),
         "pixel_spacing_x_mm": result.scale.sx,
         "pixel_spacing_y_mm": result.scale.sy,
         "calibration": calibration,
         "duration_ms": 1e3 * duration_s,
     }
+    best: PoseEstimate | None
+    if result:
+        best = result.estimate
+        values |= {"outcome": "accepted", "ambiguous_poses": 1}
+    else:
+        best = result.estimates[0] if result.estimates else None
+        values |= {"reason": result.reason, "ambiguous_poses": len(result.estimates)}
+    if best is not None:
+        values |= {
+            "inliers": best.inliers,
+            "residual_rms_mm": best.residual_rms_mm,
+            "residual_rms_px": best.residual_rms_px,
+            "log10_false_alarms": best.log10_false_alarms,
+            "position_std_mm": best.position_std_mm,
+            "rotation_std_deg": best.rotation_std_deg,
+            "target_error_95_mm": best.target_error_95_mm(result.options.target_in_frame_mm),
+        }
+    return values

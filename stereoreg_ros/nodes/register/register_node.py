@@ -21,7 +21,7 @@ from std_msgs.msg import Header
 from stereoreg_ros.calibration.calibrate import sighting_of
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.common.diagnostic_status import name_of_status, status_of, status_of_unusable
+from stereoreg_ros.nodes.common.diagnostic_status import name_of_status
 from stereoreg_ros.nodes.common.parameters import ParameterError
 from stereoreg_ros.nodes.common.process import run
 from stereoreg_ros.nodes.common.qos import QUEUE, publisher_of
@@ -36,6 +36,7 @@ from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse, ScaleKeeper
 from stereoreg_ros.nodes.register.scale_services import ScaleServices
 from stereoreg_ros.nodes.register.slice_input import SliceInput
 from stereoreg_ros.nodes.register.slice_registration import Registered, SliceSetup, Unusable, register_incoming
+from stereoreg_ros.nodes.register.slice_status import status_of, status_of_unusable
 from stereoreg_ros.nodes.register.stream_status import StreamCounts, StreamStatus
 from stereoreg_ros.nodes.register.target_keeper import TargetKeeper
 from stereoreg_ros.nodes.register.worker import Worker
@@ -224,17 +225,8 @@ class RegisterNode(Node):
         frames = [(output.frame.name, len(output.frame)) for output in self._outputs]
         scale = self._scale.scale_for(incoming.spacing)
         return [
-            status_of_unusable(
-                unusable.reason,
-                unusable.message,
-                frame_name=name,
-                lines=lines,
-                pixel_spacing=(scale.scale.sx, scale.scale.sy) if scale else (0.0, 0.0),
-                calibration=scale.source if scale else "configured",
-                duration_s=unusable.duration_s,
-                hardware_id=self._axes_of(incoming),
-            )
-            for name, lines in frames or [(source, 0) for source in self.settings.frame_sources]
+            status_of_unusable(unusable, name, rods, scale, self._axes_of(incoming))
+            for name, rods in frames or [(source, 0) for source in self.settings.frame_sources]
         ]
 
     def _publish_statuses(self, statuses: list[DiagnosticStatus], stamp: Time) -> None:

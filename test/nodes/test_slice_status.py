@@ -14,7 +14,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.nodes.common.diagnostic_status import NAME, status_of, status_of_unusable
+from stereoreg_ros.nodes.common.diagnostic_status import NAME
+from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse
+from stereoreg_ros.nodes.register.slice_registration import Unusable
+from stereoreg_ros.nodes.register.slice_status import status_of, status_of_unusable
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from support.contract import DIAGNOSTIC_KEYS
@@ -55,7 +58,7 @@ def test_a_refused_slice_is_an_error_with_its_sentence() -> None:
 
 
 def test_an_image_that_never_came_to_registration_has_the_same_keys_and_nothing_found() -> None:
-    status = status_of_unusable("bad_image", "no image", "cube6", 6, (0.4, 0.7), "configured", 0.0125, "ct")
+    status = status_of_unusable(Unusable("bad_image", "no image", 0.0125), "cube6", 6, ScaleInUse(SCALE), "ct")
     assert (status.level, status.message) == (DiagnosticStatus.ERROR, "no image")
     values = values_of(status)
     assert list(values) == list(DIAGNOSTIC_KEYS)
