@@ -136,7 +136,7 @@ def test_two_different_ones_are_none_whatever_comes_after(other: SlicePlane, thi
         assembly.add_part(PLANE, ONE, one)
     assembly.add_image(image(), 0.0, [PLANE])
     refused = only(assembly)
-    assert refused.fault == "two different slice_pose messages bear the image's stamp, expected one"
+    assert refused.fault == "two different slice_pose messages have the image's stamp, expected one"
     assert refused.plane is None
     # Once the image has had its answer, the stamp is free again.
     assembly.add_part(PLANE, ONE, other)
@@ -160,7 +160,7 @@ def test_two_images_of_one_stamp_are_refused_a_plane_that_may_be_of_either() -> 
     assembly.add_part(PLANE, ONE, plane())
     first = only(assembly)
     assert first.image.height == 1
-    assert first.fault == "two images bear one stamp, expected one to tell whose slice_pose this is"
+    assert first.fault == "two images have the same stamp, expected one: nothing shows whose slice_pose this is"
     assert only(assembly, WAIT_S).image.height == 2
 
 

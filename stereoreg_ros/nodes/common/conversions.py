@@ -121,7 +121,7 @@ def scale_to_message(scale: PixelScale) -> Vector3:
 
 
 def scale_from_message(message: Vector3Stamped) -> PixelScale:
-    """The pixel scale of a Vector3Stamped; MessageError where it is none."""
+    """The pixel scale of a Vector3Stamped; MessageError where it is invalid."""
     vector = message.vector
     try:
         return PixelScale(vector.x * MM_PER_M, vector.y * MM_PER_M, vector.z * MM_PER_M)

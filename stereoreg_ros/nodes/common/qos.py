@@ -1,4 +1,4 @@
-"""Quality of service of the node's topics: reliable, to be overridden by parameters, and told where it does not fit."""
+"""Quality of service of the node's topics: reliable, can be overridden by parameters, logged where it does not match."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def subscription_of(
 
 @contextmanager
 def _overrides_by_name() -> Iterator[None]:
-    """Overrides that are none end in a ParameterError."""
+    """Invalid overrides end in a ParameterError."""
     try:
         yield
     except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:

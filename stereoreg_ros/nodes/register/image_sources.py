@@ -13,7 +13,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 LEASE_S: Final = 30.0
 # Of the identifier of a publisher, so much is that of its process.
 _PROCESS_BYTES: Final = 12
-# What ROS calls a node of which only the topics are known: it has just come, or is none of ROS.
+# What ROS calls a node of which only the topics are known: it has just appeared, or is not a ROS node.
 _UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"
 
 
@@ -26,7 +26,7 @@ class ImageSources:
         self._seen_s: list[dict[bytes, float]] = [{} for _ in inputs]
 
     def fault(self, now_s: float) -> str:
-        """Why slices cannot be told apart by their source at `now_s`, of a steady clock; nothing where they can.
+        """Why the source of the slices is not clear at `now_s`, of a steady clock; an empty string where it is.
 
         Publishers of one process and node name are one source. Two processes of one node name are one that was killed
         and the one in its place, unless they stay. To be called at least every few seconds, so that it is seen since

@@ -17,7 +17,7 @@ from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 
 @dataclass(frozen=True)
 class NodeSettings:
-    """Everything `register_node` is told, valid as a whole.
+    """The settings of `register_node`, valid as a whole.
 
     Raises ValueError, naming the parameter, what was found and what was expected.
     """

@@ -136,7 +136,7 @@ class ScaleKeeper:
         """Use a scale measured from the sightings; returns whether it could be set, and a sentence for the operator."""
         nominal = self._stated or self._configured
         if nominal is None:
-            return False, "the measured scale cannot be set: there is none that it could replace"
+            return False, "the measured scale cannot be set: there is no pixel spacing that it could replace"
         before, self._record = self._record, CalibrationRecord.of(outcome, nominal, frame.name)
         if fault := self._set(outcome.scale):
             self._record = before

@@ -80,7 +80,9 @@ class SliceAssembly:
         takers = [one for one in self._waiting if topic in one.missing and _key(one.image.header.stamp) == key]
         if takers:
             if len(takers) > 1:
-                part = MessageError(f"two images bear one stamp, expected one to tell whose {topic} this is")
+                part = MessageError(
+                    f"two images have the same stamp, expected one: nothing shows whose {topic} this is"
+                )
             takers[0].parts[topic] = part
             takers[0].missing.remove(topic)
             return
@@ -90,7 +92,7 @@ class SliceAssembly:
             # Nothing that comes later says which of two was right, or what could not be read.
             part = known
         elif known is not None and not isinstance(part, MessageError) and not _are_same(known, part):
-            part = MessageError(f"two different {topic} messages bear the image's stamp, expected one")
+            part = MessageError(f"two different {topic} messages have the image's stamp, expected one")
         kept[key] = part
         while len(kept) > CAPACITY:
             kept.popitem(last=False)

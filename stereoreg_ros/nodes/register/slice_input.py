@@ -55,7 +55,7 @@ class SliceInput:
         return len(self._assembly)
 
     def fault(self, now_s: float) -> str:
-        """Why slices cannot be told apart by their source now; see `ImageSources.fault`."""
+        """Why the source of the slices is not clear now; see `ImageSources.fault`."""
         return self._sources.fault(now_s)
 
     def _on_image(self, image: Image) -> None:

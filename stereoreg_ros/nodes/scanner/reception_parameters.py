@@ -17,7 +17,7 @@ _BYTES_PER_MB = 2**20
 
 @dataclass(frozen=True)
 class ReceptionSettings:
-    """What `receive_dicom_node` is told, valid as a whole.
+    """The settings of `receive_dicom_node`, valid as a whole.
 
     Raises ValueError, naming the parameter, what was found and what was expected.
     """

@@ -42,7 +42,7 @@ _SMALL_FRAME: Final = 0.3
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """Everything `simulate_node` is told when it starts.
+    """The settings of `simulate_node` at its start.
 
     Raises ValueError, naming the parameter, what was found and what was expected.
     """
