@@ -1,4 +1,4 @@
-"""Quality of service of the node's topics: reliable, can be overridden by parameters, logged where it does not match."""
+"""Quality of service of topics: reliable, can be overridden by parameters, and logged where it does not match."""
 
 from __future__ import annotations
 
