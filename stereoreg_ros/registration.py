@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_from_quaternion
 from stereoreg_ros.geometry.projection import Cuts, cut_jacobian, point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.judgement import (
     DEGENERATE_ROTATION_DEG,
     WEAK_POSITION_MM,
@@ -41,7 +42,7 @@ from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Recognition, Refusal, Registration
 from stereoreg_ros.solvers.likelihood_valley import covariance_along_valley
-from stereoreg_ros.spots import FoundSpots, find_spots
+from stereoreg_ros.spots import find_spots
 from stereoreg_ros.uncertainty import Whitened, checked_scale_covariance, enclosing_covariance, in_scanner_axes
 
 _MATCHERS = {"three_line": by_levels.match, "maurin2009": maurin2009.match}
@@ -79,8 +80,8 @@ def register_slice(
     """
     options = options or RegistrationOptions()
     known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    seen = _seen(find_spots(ct_slice, options), ct_slice, options, known)
-    return _register(seen, frame, options, previous)
+    spots = replace(find_spots(ct_slice, options), scale_covariance=known)
+    return register_slice_spots(spots, frame, options, previous)
 
 
 def register_frames(
@@ -99,12 +100,12 @@ def register_frames(
     """
     options = options or RegistrationOptions()
     known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    whole = _seen(find_spots(ct_slice, options), ct_slice, options, known)
+    whole = replace(find_spots(ct_slice, options), scale_covariance=known)
     before = list(previous or [None] * len(frames))
     if len(before) != len(frames):
         raise ValueError(f"previous has {len(before)} poses, expected one for each of {len(frames)} frames")
-    offered = [np.arange(len(whole.spots_px)) for _ in frames]
-    results = [_register(whole, frame, options, guess) for frame, guess in zip(frames, before, strict=True)]
+    offered = [np.arange(len(whole)) for _ in frames]
+    results = [register_slice_spots(whole, frame, options, guess) for frame, guess in zip(frames, before, strict=True)]
     while True:
         claims = {
             row: set(offered[row][[match.spot for match in result.matches]].tolist())
@@ -123,43 +124,8 @@ def register_frames(
         if loser is None:
             return results
         offered[loser] = np.array([spot for spot in offered[loser] if spot not in kept], dtype=np.intp)
-        results[loser] = _register(whole.only(offered[loser]), frames[loser], options, before[loser])
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What a slice shows: n spots, and what is known of them.
-
-    spots_px: (n, 2); covariances_px2: (n, 2, 2) of their centres, zero where not known; streaks: their lengths, None
-    where not known; area_mm2: over which they could have been found, None where not known; scale_covariance: see
-    `register_spots`.
-    """
-
-    spots_px: Array
-    covariances_px2: Array
-    streaks: Streaks | None
-    scale: PixelScale
-    scanner_from_slice: Pose
-    area_mm2: float | None
-    scale_covariance: Array | None
-
-    def only(self, rows: NDArray[np.intp]) -> _Seen:
-        """Some of the spots."""
-        streaks = None if self.streaks is None else self.streaks.only(rows)
-        return replace(self, spots_px=self.spots_px[rows], covariances_px2=self.covariances_px2[rows], streaks=streaks)
-
-
-def _seen(found: FoundSpots, ct_slice: Slice, options: RegistrationOptions, scale_covariance: Array | None) -> _Seen:
-    scale = ct_slice.scale
-    return _Seen(
-        found.centres_px,
-        found.covariances_px2,
-        _streaks(found, scale, options.slice_thickness_mm) if options.slice_thickness_mm > 0 else None,
-        scale,
-        ct_slice.scanner_from_slice,
-        ct_slice.hu.size * scale.sx * scale.sy,
-        scale_covariance,
-    )
+        left = whole.take(offered[loser])
+        results[loser] = register_slice_spots(left, frames[loser], options, before[loser])
 
 
 def register_spots(
@@ -185,77 +151,57 @@ def register_spots(
     the scale was measured: what it makes the pose uncertain by is added to the pose's covariance.
     Raises ValueError where the spots are not of shape (n, 2) or not finite, or a covariance is none.
     """
-    seen = _given(spots_px, scale, scanner_from_slice, slice_area_mm2, covariances_px2, scale_covariance)
-    return _register(seen, frame, options or RegistrationOptions(), previous)
+    spots = SliceSpots(
+        np.asarray(spots_px, dtype=np.float64),
+        scale,
+        scanner_from_slice=scanner_from_slice or Pose.identity(),
+        area_mm2=slice_area_mm2,
+        scale_covariance=None if scale_covariance is None else checked_scale_covariance(scale_covariance),
+    )
+    if covariances_px2 is not None:
+        spots = replace(spots, covariances_px2=np.asarray(covariances_px2, dtype=np.float64))
+    return register_slice_spots(spots, frame, options, previous)
 
 
-def recognise_spots(
-    spots_px: ArrayLike,
-    frame: Frame,
-    scale: PixelScale,
-    options: RegistrationOptions | None = None,
-    scanner_from_slice: Pose | None = None,
-    slice_area_mm2: float | None = None,
-    covariances_px2: ArrayLike | None = None,
-) -> Recognition | None:
+def recognise(spots: SliceSpots, frame: Frame, options: RegistrationOptions | None = None) -> Recognition | None:
     """What the spots look most like, the most rods before the best fit, or None where they look like no part of it.
 
     It is not judged, and nothing is sought that speaks against it: a pose for those who test it in another way, as the
-    calibration does with scales. Arguments and errors: see `register_spots`.
+    calibration does with scales.
     """
     options = options or RegistrationOptions()
-    seen = _given(spots_px, scale, scanner_from_slice, slice_area_mm2, covariances_px2, None)
-    if check_orientation(frame, options) or check_count(len(seen.spots_px), options):
+    if check_orientation(frame, options) or check_count(len(spots), options):
         return None
-    spots, prior = _sought(seen, frame, options)
-    found = by_levels.match_most(spots, frame, prior, options)
-    if not found:
-        return None
-    estimate = _estimate(found[0], False, spots, frame, seen)
-    return Recognition(scale, options, seen.spots_px, estimate, seen.covariances_px2)
+    sought, prior = _sought(spots, frame, options)
+    found = by_levels.match_most(sought, frame, prior, options)
+    return Recognition(spots, options, _estimate(found[0], False, sought, frame, spots)) if found else None
 
 
-def _given(
-    spots_px: ArrayLike,
-    scale: PixelScale,
-    scanner_from_slice: Pose | None,
-    slice_area_mm2: float | None,
-    covariances_px2: ArrayLike | None,
-    scale_covariance: ArrayLike | None,
-) -> _Seen:
-    """Spots that somebody else has found, checked; see `register_spots`."""
-    spots_px = np.asarray(spots_px, dtype=np.float64)
-    if spots_px.size == 0:
-        spots_px = spots_px.reshape(0, 2)
-    if spots_px.ndim != 2 or spots_px.shape[1] != 2:
-        raise ValueError(f"spots_px has shape {spots_px.shape}, expected (n, 2)")
-    if not np.isfinite(spots_px).all():
-        raise ValueError("spots_px must be finite")
-    covariances_px2 = _checked(covariances_px2, len(spots_px))
-    known = None if scale_covariance is None else checked_scale_covariance(scale_covariance)
-    return _Seen(spots_px, covariances_px2, None, scale, scanner_from_slice or Pose.identity(), slice_area_mm2, known)
-
-
-def _sought(seen: _Seen, frame: Frame, options: RegistrationOptions) -> tuple[Spots, Prior]:
+def _sought(seen: SliceSpots, frame: Frame, options: RegistrationOptions) -> tuple[Spots, Prior]:
     """The spots in mm with their errors, and the rotations allowed, as the matchers want them."""
     scale = seen.scale
-    covariances_mm2 = scale.matrix @ at_least(seen.covariances_px2, options.spot_noise_px) @ scale.matrix.T
+    covariances_mm2 = scale.matrix @ seen.noise_px2(options.spot_noise_px) @ scale.matrix.T
     tolerances = _tolerances(frame, scale, options, seen.scale_covariance)
-    spots = Spots.of(scale.to_mm(seen.spots_px), covariances_mm2, seen.area_mm2, tolerances, seen.streaks)
+    streaks = Streaks.of(seen, options.slice_thickness_mm)
+    spots = Spots.of(seen.centres_mm, covariances_mm2, seen.area_mm2, tolerances, streaks)
     nominal = seen.scanner_from_slice.rotation.T @ rotation_from_quaternion(options.nominal_orientation)
     return spots, Prior(nominal, math.radians(options.max_rotation_deg))
 
 
-def _register(seen: _Seen, frame: Frame, options: RegistrationOptions, previous: Pose | None) -> Registration | Refusal:
-    """Match, estimate, judge; see `register_spots`."""
+def register_slice_spots(
+    seen: SliceSpots, frame: Frame, options: RegistrationOptions | None = None, previous: Pose | None = None
+) -> Registration | Refusal:
+    """Register `frame` from the spots of a slice, whoever found them: match, estimate, judge.
+
+    previous: see `register_spots`.
+    """
+    options = options or RegistrationOptions()
 
     def refusal(verdict: Verdict, estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
         assert verdict.reason is not None
-        return Refusal(
-            frame, seen.scale, seen.spots_px, verdict.reason, verdict.message, estimates, seen.covariances_px2, options
-        )
+        return Refusal(frame, seen, verdict.reason, verdict.message, estimates, options)
 
-    unfit = check_orientation(frame, options) or check_count(len(seen.spots_px), options)
+    unfit = check_orientation(frame, options) or check_count(len(seen), options)
     if unfit is not None:
         return refusal(unfit)
     spots, prior = _sought(seen, frame, options)
@@ -273,13 +219,13 @@ def _register(seen: _Seen, frame: Frame, options: RegistrationOptions, previous:
         found,
         estimates,
         frame,
-        len(seen.spots_px),
+        len(seen),
         allowed,
         lambda: _rivals(found.hypotheses[0], spots, frame, prior, allowed, is_near),
     )
     if verdict.reason is not None:
         return refusal(verdict, estimates)
-    return Registration(frame, seen.scale, options, seen.spots_px, estimates[0], verdict.message, seen.covariances_px2)
+    return Registration(frame, seen, options, estimates[0], verdict.message)
 
 
 def _rivals(
@@ -321,40 +267,7 @@ def _tolerances(
     return Tolerances.of(frame, rods_mm, scale, options.scale_tolerance, scale_covariance, options.slice_thickness_mm)
 
 
-def _streaks(found: FoundSpots, scale: PixelScale, thickness_mm: float) -> Streaks:
-    """How long the spots are: a uniform streak has a twelfth of its squared length as second moment."""
-    moments_mm2 = scale.matrix @ found.extents_px2 @ scale.matrix.T
-    values, vectors = np.linalg.eigh(moments_mm2)
-    length_mm = np.sqrt(12 * np.maximum(values[:, 1] - values[:, 0], 0.0))
-    return Streaks(length_mm[:, None] * vectors[:, :, 1], found.cut_short, thickness_mm)
-
-
-def _checked(covariances_px2: ArrayLike | None, spots: int) -> Array:
-    """Covariances (spots, 2, 2); zero where there are none."""
-    if covariances_px2 is None:
-        return np.zeros((spots, 2, 2))
-    covariances = np.asarray(covariances_px2, dtype=np.float64)
-    if covariances.shape != (spots, 2, 2):
-        raise ValueError(f"covariances_px2 has shape {covariances.shape}, expected ({spots}, 2, 2)")
-    turned = np.swapaxes(covariances, 1, 2)
-    if not np.isfinite(covariances).all() or not np.allclose(covariances, turned, rtol=1e-6, atol=1e-12):
-        raise ValueError("covariances_px2 must be finite and symmetric")
-    covariances = 0.5 * (covariances + turned)
-    if spots and np.linalg.eigvalsh(covariances).min() < -1e-9:
-        raise ValueError("covariances_px2 holds a matrix with a negative variance")
-    return covariances
-
-
-def at_least(covariances_px2: Array, noise_px: float) -> Array:
-    """Covariances (n, 2, 2) without a direction of a smaller standard deviation than noise_px."""
-    if not covariances_px2.any():
-        return np.tile(noise_px**2 * np.eye(2), (len(covariances_px2), 1, 1))
-    values, vectors = np.linalg.eigh(covariances_px2)
-    raised: Array = (vectors * np.maximum(values, noise_px**2)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    return raised
-
-
-def _estimate(hypothesis: Hypothesis, is_best: bool, spots: Spots, frame: Frame, seen: _Seen) -> PoseEstimate:
+def _estimate(hypothesis: Hypothesis, is_best: bool, spots: Spots, frame: Frame, seen: SliceSpots) -> PoseEstimate:
     slice_from_frame = Pose(hypothesis.rotation, hypothesis.translation)
     predicted_px, cuts = project(frame, slice_from_frame, seen.scale)
     lines = np.flatnonzero(hypothesis.spot_of_line != UNMATCHED)
@@ -375,7 +288,7 @@ def _estimate(hypothesis: Hypothesis, is_best: bool, spots: Spots, frame: Frame,
         covariance=in_scanner_axes(covariance + whitened.covariance_by_shifts(), seen.scanner_from_slice),
         matches=tuple(
             Match(
-                frame.line_names[line], int(line), int(spot), seen.spots_px[spot], predicted_px[line], float(distance)
+                frame.line_names[line], int(line), int(spot), seen.centres_px[spot], predicted_px[line], float(distance)
             )
             for line, spot, distance in zip(lines, rows, distances, strict=True)
         ),
@@ -393,7 +306,7 @@ def _whitened(
     rows: NDArray[np.intp],
     whitening: Array,
     common: Array,
-    seen: _Seen,
+    seen: SliceSpots,
 ) -> Whitened:
     """The residuals of the matched rods at a pose.
 

@@ -15,8 +15,9 @@ from scipy.special import gammaincc
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
-from stereoreg_ros.registration import at_least, recognise_spots, register_spots
+from stereoreg_ros.registration import recognise, register_slice_spots
 from stereoreg_ros.result import Recognition, Refusal, Registration
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import calibrate_linear, calibrate_newton_raphson
@@ -46,26 +47,6 @@ _APART = 3.0
 _NOT_TOLD_APART = "Scale and size of the frame cannot be told apart from slices"
 # The largest that a limit of a registration can be.
 _ANY_MM = 1000.0
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """The spots of one slice, whatever was made of them.
-
-    spots_px: (n, 2); covariances_px2: (n, 2, 2) of their centres; pixels: of the slice, None where not known;
-    scanner_from_slice: its plane; stated: the pixel scale that came with the slice, None where none did, and somebody
-    typed it in.
-    """
-
-    spots_px: Array
-    covariances_px2: Array
-    pixels: int | None = None
-    scanner_from_slice: Pose | None = None
-    stated: PixelScale | None = None
-
-    def area_mm2(self, scale: PixelScale) -> float | None:
-        """Of the slice with this scale, mm/pixel; None where its size is not known."""
-        return self.pixels * scale.sx * scale.sy if self.pixels else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,18 +86,8 @@ class CalibrationRefusal:
         return False
 
 
-def sighting_of(
-    result: Registration | Refusal,
-    pixels: int | None = None,
-    plane: Pose | None = None,
-    stated: PixelScale | None = None,
-) -> Sighting:
-    """The spots of a registered or refused slice; see `Sighting`."""
-    return Sighting(result.spots_px, _covariances(result), pixels, plane, stated)
-
-
 def calibrate(
-    sightings: Sequence[Sighting],
+    slices: Sequence[SliceSpots],
     frame: Frame,
     scale: PixelScale,
     options: RegistrationOptions | None = None,
@@ -126,18 +97,18 @@ def calibrate(
     """One pixel scale from slices that show the frame, by joint maximum likelihood with a pose for each.
 
     scale: the one in use, mm/pixel; where it leaves slices unexplained, others are tried. What came with the slices
-    themselves (`Sighting.stated`) is known far better than what somebody typed in, and is changed by far less: see
-    `CalibrationOptions.calibration_max_change`. The rods are where `frame` has them within their tolerances, those of
-    the frame or `frame_tolerance_mm`; a frame of another size altogether looks like another scale. progress: called
+    themselves (`SliceSpots.stated_scale`) is known far better than what somebody typed in, and is changed by far less:
+    see `CalibrationOptions.calibration_max_change`. The rods are where `frame` has them within their tolerances, those
+    of the frame or `frame_tolerance_mm`; a frame of another size altogether looks like another scale. progress: called
     with the share of the scales that was tried, says whether to go on; where not, the calibration is refused.
     """
     options, calibration = options or RegistrationOptions(), calibration or CalibrationOptions()
-    if not sightings:
+    if not slices:
         return CalibrationRefusal("calibration refused: there is no slice to calibrate from")
-    enough = [one for one in sightings if len(one.spots_px) >= max(MIN_LINES, options.min_inliers)]
+    enough = [one for one in slices if len(one) >= max(MIN_LINES, options.min_inliers)]
     if not enough:
         return CalibrationRefusal(
-            f"calibration refused: {MIN_LINES} rods are needed, and none of {len(sightings)} slices has so many spots"
+            f"calibration refused: {MIN_LINES} rods are needed, and none of {len(slices)} slices has so many spots"
         )
     found = _explained(enough, frame, scale, options, calibration)
     if isinstance(found, str) or len(found.matched) < _EXPLAINED * len(enough):
@@ -165,7 +136,7 @@ class _Explained:
     frame: Frame
     joint: TolerantScale
     matched: list[Registration]
-    sightings: list[Sighting]
+    slices: list[SliceSpots]
 
     @property
     def rods(self) -> int:
@@ -195,7 +166,7 @@ class _Explained:
     @property
     def stated(self) -> PixelScale | None:
         """The scale that came with the slices, with the last one that has any."""
-        return next((one.stated for one in reversed(self.sightings) if one.stated is not None), None)
+        return next((one.stated_scale for one in reversed(self.slices) if one.stated_scale is not None), None)
 
     @property
     def _excess(self) -> float:
@@ -203,17 +174,17 @@ class _Explained:
 
 
 def _explained(
-    sightings: Sequence[Sighting],
+    slices: Sequence[SliceSpots],
     frame: Frame,
     start: PixelScale,
     options: RegistrationOptions,
     calibration: CalibrationOptions,
 ) -> _Explained | str:
     """The slices that a scale near `start` explains, and that scale, by matching and measuring in turn; or why none."""
-    matched = _matched(sightings, frame, start, options)
+    matched = _matched(slices, frame, start, options)
     if not matched:
         return (
-            f"in none of {len(sightings)} slices the rods could be identified, with the pixel spacing "
+            f"in none of {len(slices)} slices the rods could be identified, with the pixel spacing "
             f"({start.sx:.4f}, {start.sy:.4f}) mm/pixel or one up to {100 * _reach(calibration):.3g} % off"
         )
     most = max(len(one.matches) for _, one in matched)
@@ -225,62 +196,56 @@ def _explained(
     used = _rich(matched)
     for _ in range(_ROUNDS):
         joint = _joint(frame, [one for _, one in used], calibration.calibrate_shear)
-        before, used = used, _rich(_matched(sightings, frame, joint.scale, options))
+        before, used = used, _rich(_matched(slices, frame, joint.scale, options))
         if not used:
             return f"with the scale found, {joint.scale.sx:.4f}, {joint.scale.sy:.4f} mm/pixel, no slice is identified"
         if _pairs(used) == _pairs(before):
             break
     registrations = [one for _, one in used]
     joint = _joint(frame, registrations, calibration.calibrate_shear)
-    return _Explained(frame, joint, registrations, [sighting for sighting, _ in used])
+    return _Explained(frame, joint, registrations, [spots for spots, _ in used])
 
 
 def _matched(
-    sightings: Sequence[Sighting], frame: Frame, scale: PixelScale, options: RegistrationOptions
-) -> list[tuple[Sighting, Registration]]:
+    slices: Sequence[SliceSpots], frame: Frame, scale: PixelScale, options: RegistrationOptions
+) -> list[tuple[SliceSpots, Registration]]:
     """The slices that are accepted with this scale."""
-    results = ((one, match_sighting(one, frame, scale, options)) for one in sightings)
+    results = ((one, match_slice(one, frame, scale, options)) for one in slices)
     return [(one, result) for one, result in results if result]
 
 
-def match_sighting(
-    sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
+def match_slice(
+    spots: SliceSpots, frame: Frame, scale: PixelScale, options: RegistrationOptions
 ) -> Registration | Refusal:
     """Register the frame from the spots of a slice with this scale, mm/pixel, however weakly its pose is known."""
     # Which spot is which rod is all that is asked.
     options = replace(options, max_position_std_mm=_ANY_MM, max_target_error_mm=_ANY_MM)
-    plane, covariances = sighting.scanner_from_slice, sighting.covariances_px2
-    area_mm2 = sighting.area_mm2(scale)
-    return register_spots(sighting.spots_px, frame, scale, options, plane, area_mm2, covariances_px2=covariances)
+    return register_slice_spots(spots.with_scale(scale), frame, options)
 
 
-def _recognised(
-    sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
-) -> Recognition | None:
+def _recognised(spots: SliceSpots, frame: Frame, scale: PixelScale, options: RegistrationOptions) -> Recognition | None:
     """What the spots of a slice look most like with this scale, where that says something of the scale."""
-    plane, covariances = sighting.scanner_from_slice, sighting.covariances_px2
-    area_mm2 = sighting.area_mm2(scale)
-    seen = recognise_spots(sighting.spots_px, frame, scale, options, plane, area_mm2, covariances)
+    seen = recognise(spots.with_scale(scale), frame, options)
     return None if seen is None or len(seen.matches) < MIN_LINES or _degenerate(frame, [seen]) else seen
 
 
-def _rich(matched: Sequence[tuple[Sighting, Registration]]) -> list[tuple[Sighting, Registration]]:
+def _rich(matched: Sequence[tuple[SliceSpots, Registration]]) -> list[tuple[SliceSpots, Registration]]:
     """Those with rods enough to say something of the scale."""
-    return [(sighting, one) for sighting, one in matched if len(one.matches) >= MIN_LINES]
+    return [(spots, one) for spots, one in matched if len(one.matches) >= MIN_LINES]
 
 
-def _pairs(matched: Sequence[tuple[Sighting, Registration]]) -> list[tuple[int, list[tuple[int, int]]]]:
-    return [(id(sighting), [(match.line_index, match.spot) for match in one.matches]) for sighting, one in matched]
+def _pairs(matched: Sequence[tuple[SliceSpots, Registration]]) -> list[tuple[int, list[tuple[int, int]]]]:
+    return [(id(spots), [(match.line_index, match.spot) for match in one.matches]) for spots, one in matched]
 
 
-def _left_out(sightings: Sequence[Sighting], found: _Explained | str) -> list[Sighting]:
+def _left_out(slices: Sequence[SliceSpots], found: _Explained | str) -> list[SliceSpots]:
     """Slices that are not explained."""
-    explained = set() if isinstance(found, str) else {id(one) for one in found.sightings}
-    return [one for one in sightings if id(one) not in explained]
+    explained = set() if isinstance(found, str) else {id(one) for one in found.slices}
+    return [one for one in slices if id(one) not in explained]
 
 
 def _search(
-    sightings: Sequence[Sighting],
+    slices: Sequence[SliceSpots],
     frame: Frame,
     scale: PixelScale,
     options: RegistrationOptions,
@@ -293,7 +258,7 @@ def _search(
     from it, and the slice must be accepted with it at the noise that is stated, as rarely by chance as all scales tried
     require. The scales nearest to the one in use come first.
     """
-    waiting = list(sightings[-_SEARCHED:])
+    waiting = list(slices[-_SEARCHED:])
     factors = _factors(_reach(calibration))
     ends = np.concatenate([frame.starts, frame.ends])
     off_mm = _OFF * float(np.linalg.norm(np.ptp(ends, axis=0))) / 2
@@ -310,15 +275,15 @@ def _search(
         # The same in mm for all scales, as the matcher keeps a table for each noise.
         noise_px = min(max(options.spot_noise_px, off_mm / max(start.sx, start.sy)), 10.0)
         loose = replace(loose, spot_noise_px=noise_px)
-        for sighting in list(waiting):
+        for spots in list(waiting):
             if progress is not None and not progress(number / len(factors)):
                 yield None
-            seen = _recognised(sighting, frame, start, loose)
+            seen = _recognised(spots, frame, start, loose)
             if seen is None:
                 continue
             measured = _joint(frame, [seen], with_shear=False).scale
-            if match_sighting(sighting, frame, measured, strict):
-                waiting = [one for one in waiting if one is not sighting]
+            if match_slice(spots, frame, measured, strict):
+                waiting = [one for one in waiting if one is not spots]
                 yield measured
         if not waiting:
             return
@@ -371,8 +336,8 @@ def _posed(
     for row, one in enumerate(matched):
         lines, spots = _couples(one)
         spots_px[row, lines], used[row, lines] = spots, True
-        own = _covariances(one)[[match.spot for match in one.matches]]
-        covariances[row, lines] = at_least(own, one.options.spot_noise_px)
+        own = [match.spot for match in one.matches]
+        covariances[row, lines] = one.spots.noise_px2(one.options.spot_noise_px)[own]
     poses = [one.estimate.slice_from_frame for one in matched]
     rotations = np.array([pose.rotation for pose in poses])
     translations = np.array([pose.translation for pose in poses])
@@ -383,11 +348,6 @@ def _couples(registration: Registration | Recognition) -> tuple[NDArray[np.intp]
     """The rods (k,) that were identified, and their spots (k, 2) in pixel."""
     lines = np.array([match.line_index for match in registration.matches])
     return lines, np.array([match.spot_px for match in registration.matches])
-
-
-def _covariances(result: Registration | Recognition | Refusal) -> Array:
-    known = result.covariances_px2
-    return np.zeros((len(result.spots_px), 2, 2)) if known is None else known
 
 
 def _degenerate(frame: Frame, matched: Sequence[Registration | Recognition]) -> str:

@@ -16,8 +16,8 @@ from rcl_interfaces.msg import SetParametersResult
 from std_srvs.srv import Trigger
 
 from stereoreg_ros import PixelScale, RegistrationOptions
-from stereoreg_ros.calibration.calibrate import Sighting
 from stereoreg_ros.calibration.file import CalibrationRecord, save_calibration
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.register.scale_keeper import ScaleKeeper
 from stereoreg_ros.options import CalibrationOptions
 
@@ -108,7 +108,7 @@ def test_told_and_measured_and_gone_back_on(tmp_path: Path) -> None:
 
 def test_the_last_slices_are_kept_however_many_they_may_be() -> None:
     keeper = Stand(TOLD).keeper
-    slices = [Sighting(np.full((4, 2), float(k)), np.zeros((4, 2, 2))) for k in range(13)]
+    slices = [SliceSpots(np.full((4, 2), float(k)), TOLD) for k in range(13)]
     keeper.sightings.extend(slices[:12])
     assert list(keeper.sightings) == slices[2:12]  # ten by default
     keeper.keep_slices(3)

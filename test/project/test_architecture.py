@@ -30,8 +30,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "result": {"geometry", "options", "uncertainty"},
     "judgement": {"geometry", "options", "matching", "result"},
     "registration": {"geometry", "options", "spots", "solvers", "matching", "judgement", "result", "uncertainty"},
-    "calibration": {"files", "geometry", "options", "solvers", "result", "registration", "uncertainty"},
-    "worst_case": {"geometry", "solvers", "result", "registration"},
+    "calibration": {"files", "geometry", "options", "spots", "solvers", "result", "registration", "uncertainty"},
+    "worst_case": {"geometry", "solvers", "result"},
     "drawing": {"geometry", "options", "result", "registration"},
 }
 

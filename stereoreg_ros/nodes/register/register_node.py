@@ -7,7 +7,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
 
@@ -23,7 +23,6 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from stereoreg_ros.calibration.calibrate import sighting_of
 from stereoreg_ros.drawing import draw_overlay
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
@@ -191,8 +190,7 @@ class RegisterNode(Node):
             self._refuse_unusable("internal_error", message, header, started)
             return
         if len(results[0].spots_px) >= self.settings.options.min_inliers:
-            plane, stated = ct_slice.scanner_from_slice, unregistered.spacing
-            self._scale.sightings.append(sighting_of(results[0], ct_slice.hu.size, plane, stated))
+            self._scale.sightings.append(replace(results[0].spots, stated_scale=unregistered.spacing))
         for output, result in zip(self._outputs, results, strict=True):
             output.publish(result, header, came_s, self._axes_of(output.frame), self._send_transform)
         self._publish_statuses(statuses, header)

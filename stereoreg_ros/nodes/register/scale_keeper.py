@@ -14,7 +14,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from stereoreg_ros.calibration.calibrate import Sighting
 from stereoreg_ros.calibration.file import (
     CalibrationFileError,
     CalibrationRecord,
@@ -25,6 +24,7 @@ from stereoreg_ros.calibration.file import (
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.register.parameters import NodeSettings
 from stereoreg_ros.nodes.register.recalibration import NextTurn, Recalibration
 
@@ -51,7 +51,7 @@ class ScaleKeeper:
     def __init__(self, node: Node, registering: _Registering) -> None:
         self.source: Literal["configured", "measured"] = "configured"
         self.covariance: Array | None = None
-        self.sightings: deque[Sighting] = deque(maxlen=registering.settings.calibration.calibration_slices)
+        self.sightings: deque[SliceSpots] = deque(maxlen=registering.settings.calibration.calibration_slices)
         self._node, self._registering = node, registering
         self._configured = registering.settings.scale
         self._recalibration: Recalibration | None = None
