@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoreg_ros.calibration.calibrate import (
-    MIN_LINES,
-    Calibration,
-    CalibrationRefusal,
-    calibrate,
-    match_slice,
-)
+from stereoreg_ros.calibration.calibrate import calibrate
+from stereoreg_ros.calibration.matching import match_slice
+from stereoreg_ros.calibration.measured import MIN_LINES
+from stereoreg_ros.calibration.outcome import Calibration, CalibrationRefusal
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.geometry.spots import SliceSpots

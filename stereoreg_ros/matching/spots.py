@@ -142,6 +142,10 @@ class Spots(NamedTuple):
         covariances: Array = self.covariances_mm2[spot_of_line] + self.tolerances.rod_covariances(frame, cuts)
         return covariances
 
+    def whitening(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> Array:
+        """What turns each rod's residual in mm into one of unit variance, (..., n, 2, 2) 1/mm."""
+        return whitening_of(self.match_covariances(frame, cuts, spot_of_line))
+
     def common(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp], used: NDArray[np.bool_]) -> Array | None:
         """Errors that spots share, as `solvers.maximum_likelihood.refine` takes them; None where there are none."""
         shared = self.tolerances.common(frame, cuts, self.mm[spot_of_line], used)

@@ -13,8 +13,8 @@ from stereoreg_ros.calibration.calibrate import (
     Calibration,
     CalibrationRefusal,
     calibrate,
-    match_slice,
 )
+from stereoreg_ros.calibration.matching import match_slice
 from stereoreg_ros.calibration.series import scale_of_series
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame

@@ -15,6 +15,7 @@ from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.registration import recognise
+from stereoreg_ros.solvers.identified import IdentifiedSpots, ScaleAndPoses
 from stereoreg_ros.solvers.tolerant_calibration import calibrate_tolerantly
 from support.frames import cube_by_hand
 
@@ -189,12 +190,10 @@ def test_the_measured_scale_is_that_of_the_same_spots_in_the_rods_order() -> Non
     by_hand = calibrate_tolerantly(
         frame,
         frame.tolerances_or(np.nan),
-        np.array([pose.rotation for pose in poses]),
-        np.array([pose.translation for pose in poses]),
-        spots_px,
-        used,
-        covariances,
-        SCALE,
+        IdentifiedSpots(spots_px, used, covariances),
+        ScaleAndPoses(
+            SCALE, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses])
+        ),
     )
     assert by_hand.converged
     # The shear was not to be measured.
