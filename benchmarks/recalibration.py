@@ -16,11 +16,13 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice
-from stereoreg_ros.calibration.calibrate import Calibration, Sighting, calibrate, sighting_of
+from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
+from stereoreg_ros.calibration.calibrate import Calibration, calibrate
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
+from stereoreg_ros.spots import find_spots
 
 TRUE = PixelScale(0.5, 0.5)
 CENTRE_NOISE_PX = 0.25
@@ -42,15 +44,15 @@ class Kind(NamedTuple):
     stated: bool = False
 
 
-def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelScale) -> list[Sighting]:
+def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelScale) -> list[SliceSpots]:
     """Spots found in rendered slices of a frame, their centres shifted by CENTRE_NOISE_PX."""
     taken = []
     for _ in range(kind.slices):
         scanner = ScannerSettings(shape=(320, 320), scale=TRUE, false_spots=int(rng.integers(0, kind.most_false + 1)))
         ct_slice: Slice = render_slice([PlacedFrame(frame, random_pose(rng, frame, scanner))], scanner, rng)
-        seen = sighting_of(register_slice(ct_slice, frame), ct_slice.hu.size)
-        shifted = seen.spots_px + CENTRE_NOISE_PX * rng.standard_normal(seen.spots_px.shape)
-        taken.append(Sighting(shifted, seen.covariances_px2, seen.pixels, stated=told if kind.stated else None))
+        found = find_spots(ct_slice, RegistrationOptions())
+        shifted = found.centres_px + CENTRE_NOISE_PX * rng.standard_normal(found.centres_px.shape)
+        taken.append(replace(found, centres_px=shifted, stated_scale=told if kind.stated else None))
     return taken
 
 

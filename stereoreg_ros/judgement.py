@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import rotation_angle
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE
-from stereoreg_ros.matching.hypothesis import Found, Hypothesis
-from stereoreg_ros.matching.other_scale import OtherScale
-from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.hypothesis import Found
+from stereoreg_ros.matching.level_search import SearchGivenUpError
+from stereoreg_ros.matching.problem import Problem
+from stereoreg_ros.matching.rivals import Rivals
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import PoseEstimate, Reason
 
@@ -47,6 +48,56 @@ class Verdict:
     message: str
 
 
+@dataclass(frozen=True, eq=False)
+class Case:
+    """All that a judgement rests on.
+
+    problem: what was to be matched; options: as the caller gave them; found: what the matcher came to; estimates: of
+    `found.hypotheses`, best first; rivals: other explanations that speak against the best one, which take long to seek
+    and are asked for only where nothing else does.
+    """
+
+    problem: Problem
+    options: RegistrationOptions
+    found: Found
+    estimates: tuple[PoseEstimate, ...]
+    rivals: Rivals
+
+    @property
+    def best(self) -> PoseEstimate:
+        """The best explanation."""
+        return self.estimates[0]
+
+    @property
+    def rods(self) -> int:
+        """How many the frame has."""
+        return len(self.problem.frame)
+
+    @property
+    def spots(self) -> int:
+        """How many were offered."""
+        return len(self.problem.spots.mm)
+
+    @property
+    def matched(self) -> str:
+        """How many rods of how many the best explanation matches, in words."""
+        return f"{self.best.inliers} of {self.rods} rods"
+
+    @property
+    def stated(self) -> str:
+        """What spots, frame and scale were stated to be known to, in words."""
+        tolerances_mm = self.problem.frame.tolerances_or(self.options.frame_tolerance_mm)
+        return (
+            f"a spot noise of {self.options.spot_noise_px:g} pixel, a frame tolerance of {tolerances_mm.max():g} mm "
+            f"and a scale tolerance of {100 * self.options.scale_tolerance:g} %"
+        )
+
+
+def unfit(frame: Frame, spots: int, options: RegistrationOptions) -> Verdict | None:
+    """Why a slice with so many spots is refused before anything is sought; None where it is not."""
+    return check_orientation(frame, options) or check_count(spots, options)
+
+
 def check_count(spots: int, options: RegistrationOptions) -> Verdict | None:
     """Whether there are too few or too many spots to search."""
     if spots < options.min_inliers:
@@ -71,83 +122,53 @@ def check_orientation(frame: Frame, options: RegistrationOptions) -> Verdict | N
     return None
 
 
-def judge(
-    found: Found,
-    estimates: Sequence[PoseEstimate],
-    frame: Frame,
-    spots: int,
-    options: RegistrationOptions,
-    rivals: Callable[[], Verdict | None],
-) -> Verdict:
-    """Accept the best explanation of a slice or refuse it.
-
-    estimates: of `found.hypotheses`, best first. spots: how many were searched. rivals: looks for other explanations
-    that speak against the best one, which takes long; only asked where nothing else does.
-    """
-    if found.given_up:
-        return Verdict("no_consensus", f"the search among {spots} spots was {found.given_up}")
-    if not estimates:
-        return Verdict("no_consensus", _describe_nothing(found, len(frame), spots, options))
-    for check in (_by_chance, _residual, _several_poses, _near_misses, _pieces):
-        verdict = check(found, estimates, frame, spots, options)
-        if verdict is not None:
-            return verdict
-    return _precision(estimates[0], options) or rivals() or Verdict(None, _caution(estimates[0], options))
+def judge(case: Case) -> Verdict:
+    """Accept the best explanation of a slice, or refuse it for the first reason there is."""
+    try:
+        for reason in _REASONS:
+            verdict = reason(case)
+            if verdict is not None:
+                return verdict
+    except SearchGivenUpError:
+        return Verdict(
+            "no_consensus",
+            f"a pose of {case.best.inliers} rods was found, but the search for one that contradicts it among "
+            f"{case.spots} spots took too long: raise the threshold, or reduce clutter",
+        )
+    return Verdict(None, _caution(case.best, case.options))
 
 
-def contradicted_orientation(best: Hypothesis, other: Hypothesis, prior: Prior, lines: int) -> Verdict:
-    """Refused: beyond the configured orientation another explanation is clearly better."""
-    angle_deg = math.degrees(float(prior.angles(other.rotation)))
-    return Verdict(
-        "contradicted",
-        f"{best.inliers} of {lines} rods match within {math.degrees(prior.max_rotation):g} degrees of "
-        f"nominal_orientation, but {other.inliers}, and clearly better, with the frame at {angle_deg:.0f} degrees from "
-        "it: check nominal_orientation, max_rotation_deg and how the patient or frame lies",
-    )
-
-
-def other_scale(best: Hypothesis, other: OtherScale | None, lines: int) -> Verdict | None:
-    """Refused where one rod more has its spot with another scale, and that is clearly likelier."""
-    if other is None or other.evidence <= _MOST_EVIDENCE:
+def _given_up(case: Case) -> Verdict | None:
+    if not case.found.given_up:
         return None
-    along_x, along_y = -100 * other.too_large
-    return Verdict(
-        "contradicted",
-        f"{best.inliers} of {lines} rods match with the stated pixel spacing, but {other.inliers}, and clearly better, "
-        f"with one changed by {along_x:+.1f} % along x and {along_y:+.1f} % along y: check pixel_spacing and the size "
-        "of the frame in its file",
-    )
+    return Verdict("no_consensus", f"the search among {case.spots} spots was {case.found.given_up}")
 
 
-def second_frame(best: Hypothesis, other: Hypothesis, lines: int) -> Verdict:
-    """Refused: the spots that are left show the frame a second time."""
-    away_mm = float(np.linalg.norm(other.translation - best.translation))
-    return Verdict(
-        "ambiguous",
-        f"the slice shows the frame twice: {best.inliers} of {lines} rods match, and {other.inliers} of them match "
-        f"other spots with the frame {away_mm:.0f} mm away: remove the second frame, or tell them apart by "
-        "nominal_orientation and max_rotation_deg",
-    )
+def _nothing_found(case: Case) -> Verdict | None:
+    if case.estimates:
+        return None
+    fewest = case.found.least_rods
+    nothing = f"no pose puts {min(fewest, case.rods)} of the {case.rods} rods on any of the {case.spots} spots"
+    if fewest <= case.problem.min_inliers:
+        return Verdict("no_consensus", nothing)
+    fewer = f"{fewest - 1} rods could hardly be told from chance among so many spots"
+    return Verdict("no_consensus", f"{nothing}, and {fewer}" if fewest <= case.rods else fewer)
 
 
-def _by_chance(
-    found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
-) -> Verdict | None:
-    best = estimates[0]
-    if best.log10_false_alarms <= options.max_log10_false_alarms:
+def _by_chance(case: Case) -> Verdict | None:
+    best, allowed = case.best, case.problem.max_log10_false_alarms
+    if best.log10_false_alarms <= allowed:
         return None
     return Verdict(
         "no_consensus",
         f"chance alone would bring 10^{best.log10_false_alarms:.1f} matches as good as the best one, of "
-        f"{best.inliers} rods among {spots} spots; at most 10^{options.max_log10_false_alarms:.3g} are allowed",
+        f"{best.inliers} rods among {case.spots} spots; at most 10^{allowed:.3g} are allowed",
     )
 
 
-def _residual(
-    found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
-) -> Verdict | None:
-    """A residual that the stated errors cannot have caused, or that another scale removes."""
-    best = estimates[0]
+def _fits_another_scale(case: Case) -> Verdict | None:
+    """A residual that another scale removes."""
+    best = case.best
     misfit = best.scale_misfit
     if misfit.probability < _SCALE_IMPLAUSIBLE:
         return Verdict(
@@ -156,18 +177,23 @@ def _residual(
             f"chi-square falls by {misfit.fall:.0f} where the spacing is free; it was stated as known to "
             f"{100 * misfit.stated:.2g} %. Check pixel_spacing and the frame file",
         )
+    return None
+
+
+def _residual(case: Case) -> Verdict | None:
+    """A residual that the stated errors cannot have caused."""
+    best = case.best
     if _plausibility(best) < IMPLAUSIBLE:
         return Verdict(
             "inaccurate",
             f"the residual of {best.residual_rms_px:.2f} pixel RMS over {best.inliers} rods cannot come from "
-            f"{_stated(frame, options)}: check pixel spacing and frame file",
+            f"{case.stated}: check pixel spacing and frame file",
         )
     return None
 
 
-def _several_poses(
-    found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
-) -> Verdict | None:
+def _several_poses(case: Case) -> Verdict | None:
+    estimates = case.estimates
     if len(estimates) == 1:
         return None
     poses = []
@@ -183,45 +209,40 @@ def _several_poses(
     if same_orientation and len(matched) > 1:
         advice = (
             "they differ in which spots are rods, not in how the frame stands: rods that are off their places, or "
-            f"{_stated(frame, options)} stated too small, look so"
+            f"{case.stated} stated too small, look so"
         )
     else:
         advice = "tell them apart by nominal_orientation and max_rotation_deg"
     return Verdict("ambiguous", f"{len(estimates)} poses explain the slice equally well, {advice}: {listed}")
 
 
-def _near_misses(
-    found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
-) -> Verdict | None:
-    best = found.hypotheses[0]
+def _near_misses(case: Case) -> Verdict | None:
+    best = case.found.hypotheses[0]
     # The residual and what another scale takes from it are no two witnesses.
-    probability = min(_plausibility(estimates[0]), estimates[0].scale_misfit.probability)
+    probability = min(_plausibility(case.best), case.best.scale_misfit.probability)
     if best.near_misses + _evidence(probability) <= _MOST_EVIDENCE:
         return None
     both = "" if best.near_misses > _MOST_EVIDENCE else ", and those matched do not fit well"
     return Verdict(
         "contradicted",
-        f"{best.inliers} of {len(frame)} rods are matched, but beside the places of others, which have no spot, there "
+        f"{case.matched} are matched, but beside the places of others, which have no spot, there "
         f"are unmatched spots that would be theirs if something were slightly wrong{both}: check frame file, pixel "
         "spacing and nominal orientation",
     )
 
 
-def _pieces(
-    found: Found, estimates: Sequence[PoseEstimate], frame: Frame, spots: int, options: RegistrationOptions
-) -> Verdict | None:
-    best = found.hypotheses[0]
-    if best.pieces <= _MOST_EVIDENCE:
+def _pieces(case: Case) -> Verdict | None:
+    if case.found.hypotheses[0].pieces <= _MOST_EVIDENCE:
         return None
     return Verdict(
         "inaccurate",
-        f"{best.inliers} of {len(frame)} rods are matched, but unmatched spots crowd about theirs, as where spots have "
+        f"{case.matched} are matched, but unmatched spots crowd about theirs, as where spots have "
         "fallen to pieces: the centre of such a spot is at none of its pieces; check threshold and min_spot_area_mm2",
     )
 
 
-def _precision(best: PoseEstimate, options: RegistrationOptions) -> Verdict | None:
-    """A pose that is determined too weakly."""
+def _open_rotation(case: Case) -> Verdict | None:
+    best = case.best
     if best.rotation_std_deg > DEGENERATE_ROTATION_DEG:
         axis = np.linalg.eigh(best.covariance[3:, 3:])[1][:, -1]
         return Verdict(
@@ -229,13 +250,23 @@ def _precision(best: PoseEstimate, options: RegistrationOptions) -> Verdict | No
             f"the rotation about the axis {np.round(axis, 2).tolist()} of the scanner is known only to "
             f"{best.rotation_std_deg:.1f} degrees",
         )
+    return None
+
+
+def _weak_position(case: Case) -> Verdict | None:
+    best, options = case.best, case.options
     if best.position_std_mm > options.max_position_std_mm:
         return Verdict(
             "inaccurate",
             f"the position has a standard deviation of {best.position_std_mm:.2f} mm, "
             f"at most {options.max_position_std_mm:g} mm are allowed",
         )
-    target_error_mm = best.target_error_95_mm(options.target_in_frame_mm)
+    return None
+
+
+def _weak_at_target(case: Case) -> Verdict | None:
+    options = case.options
+    target_error_mm = case.best.target_error_95_mm(options.target_in_frame_mm)
     if target_error_mm > options.max_target_error_mm:
         target = ", ".join(f"{value:g}" for value in options.target_in_frame_mm)
         return Verdict(
@@ -245,6 +276,67 @@ def _precision(best: PoseEstimate, options: RegistrationOptions) -> Verdict | No
             "max_target_error_mm",
         )
     return None
+
+
+def _other_scale(case: Case) -> Verdict | None:
+    """One rod more has its spot with another scale, and that is clearly likelier."""
+    other = case.rivals.other_scale()
+    if other is None or other.evidence <= _MOST_EVIDENCE:
+        return None
+    along_x, along_y = -100 * other.too_large
+    return Verdict(
+        "contradicted",
+        f"{case.matched} match with the stated pixel spacing, but {other.inliers}, and clearly better, "
+        f"with one changed by {along_x:+.1f} % along x and {along_y:+.1f} % along y: check pixel_spacing and the size "
+        "of the frame in its file",
+    )
+
+
+def _other_orientation(case: Case) -> Verdict | None:
+    """Beyond the configured orientation another explanation is clearly better."""
+    other, prior = case.rivals.beyond_prior(), case.problem.prior
+    if other is None:
+        return None
+    angle_deg = math.degrees(float(prior.angles(other.rotation)))
+    return Verdict(
+        "contradicted",
+        f"{case.matched} match within {math.degrees(prior.max_rotation):g} degrees of "
+        f"nominal_orientation, but {other.inliers}, and clearly better, with the frame at {angle_deg:.0f} degrees from "
+        "it: check nominal_orientation, max_rotation_deg and how the patient or frame lies",
+    )
+
+
+def _second_frame(case: Case) -> Verdict | None:
+    """The spots that are left show the frame a second time."""
+    other = case.rivals.second_frame()
+    if other is None:
+        return None
+    away_mm = float(np.linalg.norm(other.translation - case.found.hypotheses[0].translation))
+    return Verdict(
+        "ambiguous",
+        f"the slice shows the frame twice: {case.matched} match, and {other.inliers} of them match "
+        f"other spots with the frame {away_mm:.0f} mm away: remove the second frame, or tell them apart by "
+        "nominal_orientation and max_rotation_deg",
+    )
+
+
+# In this order: what comes first is to be cured first, and the rivals, which take long, are sought last.
+_REASONS: Final[tuple[Callable[[Case], Verdict | None], ...]] = (
+    _given_up,
+    _nothing_found,
+    _by_chance,
+    _fits_another_scale,
+    _residual,
+    _several_poses,
+    _near_misses,
+    _pieces,
+    _open_rotation,
+    _weak_position,
+    _weak_at_target,
+    _other_scale,
+    _other_orientation,
+    _second_frame,
+)
 
 
 def _caution(best: PoseEstimate, options: RegistrationOptions) -> str:
@@ -274,20 +366,4 @@ def _evidence(probability: float) -> float:
 
 
 def _plausibility(best: PoseEstimate) -> float:
-    return float(chi2.sf(best.chi_square, best.degrees_of_freedom))
-
-
-def _stated(frame: Frame, options: RegistrationOptions) -> str:
-    tolerances_mm = frame.tolerances_or(options.frame_tolerance_mm)
-    return (
-        f"a spot noise of {options.spot_noise_px:g} pixel, a frame tolerance of {tolerances_mm.max():g} mm and a scale "
-        f"tolerance of {100 * options.scale_tolerance:g} %"
-    )
-
-
-def _describe_nothing(found: Found, lines: int, spots: int, options: RegistrationOptions) -> str:
-    nothing = f"no pose puts {min(found.least_rods, lines)} of the {lines} rods on any of the {spots} spots"
-    if found.least_rods <= options.min_inliers:
-        return nothing
-    fewer = f"{found.least_rods - 1} rods could hardly be told from chance among so many spots"
-    return f"{nothing}, and {fewer}" if found.least_rods <= lines else fewer
+    return float(chdtrc(best.degrees_of_freedom, best.chi_square))

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.uncertainty import ScaleMisfit, error_ball_95, point_covariance
 
@@ -118,22 +119,40 @@ class PoseEstimate:
         return error_ball_95(point_covariance(self.covariance, self.scanner_from_frame, target))
 
 
+class _OfSlice:
+    """What results have in common: the spots of the slice that they are about."""
+
+    spots: SliceSpots
+
+    @property
+    def scale(self) -> PixelScale:
+        """The pixel scale, mm/pixel."""
+        return self.spots.scale
+
+    @property
+    def spots_px(self) -> Array:
+        """The centres (n, 2) in pixel of all spots offered."""
+        return self.spots.centres_px
+
+    @property
+    def covariances_px2(self) -> Array:
+        """(n, 2, 2) of the spots' centres, as their image shows them; zero where nothing is known of that."""
+        return self.spots.covariances_px2
+
+
 @dataclass(frozen=True, eq=False)
-class Registration:
+class Registration(_OfSlice):
     """An accepted slice. True as a condition.
 
-    options: what it was made with; estimate: the pose and all that supports it; spots_px: (n, 2), all spots offered;
-    caution: a sentence where the pose is accepted but something deserves a look, else empty. covariances_px2: (n, 2, 2)
-    of the spots' centres, as their image shows them; None where nothing is known of that.
+    spots: all that were offered, with the slice's scale and plane; options: what it was made with; estimate: the pose
+    and all that supports it; caution: a sentence where the pose is accepted but something deserves a look, else empty.
     """
 
     frame: Frame
-    scale: PixelScale
+    spots: SliceSpots
     options: RegistrationOptions
-    spots_px: Array
     estimate: PoseEstimate
     caution: str = ""
-    covariances_px2: Array | None = None
 
     def __bool__(self) -> Literal[True]:
         return True
@@ -155,17 +174,15 @@ class Registration:
 
 
 @dataclass(frozen=True, eq=False)
-class Recognition:
+class Recognition(_OfSlice):
     """What the spots of a slice look most like, which nobody has judged: it may well be wrong.
 
     For those who go on to test it in another way; fields as in `Registration`.
     """
 
-    scale: PixelScale
+    spots: SliceSpots
     options: RegistrationOptions
-    spots_px: Array
     estimate: PoseEstimate
-    covariances_px2: Array
 
     @property
     def matches(self) -> tuple[Match, ...]:
@@ -174,7 +191,7 @@ class Recognition:
 
 
 @dataclass(frozen=True, eq=False)
-class Refusal:
+class Refusal(_OfSlice):
     """A slice without a pose that may be believed. False as a condition.
 
     reason: one of REASONS; message: one sentence with the figures that decided; estimates: the explanations that
@@ -183,12 +200,10 @@ class Refusal:
     """
 
     frame: Frame
-    scale: PixelScale
-    spots_px: Array
+    spots: SliceSpots
     reason: Reason
     message: str
     estimates: tuple[PoseEstimate, ...] = ()
-    covariances_px2: Array | None = None
     options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
     def __bool__(self) -> Literal[False]:
@@ -225,7 +240,7 @@ def diagnostics(result: Registration | Refusal, calibration: str, duration_s: fl
     """
     values = NOTHING_FOUND | {
         "frame": result.frame.name,
-        "spots": len(result.spots_px),
+        "spots": len(result.spots),
         "lines": len(result.frame),
         "pixel_spacing_x_mm": result.scale.sx,
         "pixel_spacing_y_mm": result.scale.sy,

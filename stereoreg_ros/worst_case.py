@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.registration import at_least
 from stereoreg_ros.result import Registration
 from stereoreg_ros.solvers.pose_error_bounds import PoseErrorModel
 
@@ -34,14 +33,12 @@ def worst_case(registration: Registration, max_spot_error_px: float) -> WorstCas
     negative or not finite.
     """
     estimate, spots = registration.estimate, [match.spot for match in registration.matches]
-    known = registration.covariances_px2
-    covariances = np.zeros((len(spots), 2, 2)) if known is None else known[spots]
     model = PoseErrorModel(
         registration.frame,
         np.array([match.line_index for match in registration.matches]),
         estimate.slice_from_frame,
         registration.spots_px[spots],
-        at_least(covariances, registration.options.spot_noise_px),
+        registration.spots.noise_px2(registration.options.spot_noise_px)[spots],
         registration.scale,
     )
     reach = model.reach(max_spot_error_px)

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoreg_ros.calibration.calibrate import (
-    MIN_LINES,
-    Calibration,
-    CalibrationRefusal,
-    Sighting,
-    calibrate,
-    match_sighting,
-    sighting_of,
-)
+from stereoreg_ros.calibration.calibrate import calibrate
+from stereoreg_ros.calibration.matching import match_slice
+from stereoreg_ros.calibration.measured import MIN_LINES
+from stereoreg_ros.calibration.outcome import Calibration, CalibrationRefusal
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
-from stereoreg_ros.registration import register_slice
 from stereoreg_ros.solvers.arrangement import DegenerateArrangementError
 from stereoreg_ros.solvers.calibration import calibrate_linear, calibrate_newton_raphson, calibration_covariance
+from stereoreg_ros.spots import find_spots
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ def scale_of_series(
 
     Raises ValueError where they have several spacings, or there is no slice.
     """
-    named: list[tuple[str, Sighting]] = []
+    named: list[tuple[str, SliceSpots]] = []
     given: PixelScale | None = None
     for name, ct_slice in slices:
         if given is not None and ct_slice.scale != given:
@@ -71,23 +67,22 @@ def scale_of_series(
                 f"expected that of the slices before, ({given.sx:g}, {given.sy:g})"
             )
         given = ct_slice.scale
-        result = register_slice(ct_slice, frame, options)
-        if len(result.spots_px) >= MIN_LINES:
-            plane, stated = ct_slice.scanner_from_slice, ct_slice.scale
-            named.append((name, sighting_of(result, ct_slice.hu.size, plane, stated)))
+        spots = find_spots(ct_slice, options)
+        if len(spots) >= MIN_LINES:
+            named.append((name, replace(spots, stated_scale=ct_slice.scale)))
     if given is None:
         raise ValueError("there is no slice to calibrate from")
-    outcome = calibrate([sighting for _, sighting in named], frame, given, options, calibration, progress)
+    outcome = calibrate([spots for _, spots in named], frame, given, options, calibration, progress)
     if not isinstance(outcome, Calibration):
         return SeriesScale(given, outcome, ())
-    alone = (_alone(name, sighting, frame, outcome.scale, options) for name, sighting in named)
+    alone = (_alone(name, spots, frame, outcome.scale, options) for name, spots in named)
     return SeriesScale(given, outcome, tuple(one for one in alone if one is not None))
 
 
 def _alone(
-    name: str, sighting: Sighting, frame: Frame, scale: PixelScale, options: RegistrationOptions
+    name: str, spots: SliceSpots, frame: Frame, scale: PixelScale, options: RegistrationOptions
 ) -> SliceScale | None:
-    result = match_sighting(sighting, frame, scale, options)
+    result = match_slice(spots, frame, scale, options)
     if not result or len(result.matches) < MIN_LINES:
         return None
     lines = np.array([match.line_index for match in result.matches])

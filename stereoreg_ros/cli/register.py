@@ -23,6 +23,7 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import FrameFileError, load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.registration import register_slice
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration, diagnostics
@@ -149,7 +150,7 @@ def _record(outcome: _Registered | _Unreadable, frame: Frame, *, slice_axes: boo
     """The JSON object of one slice: the same keys for every outcome, null for a number that does not exist."""
     record: dict[str, Any] = {"file": str(outcome.path)}
     if isinstance(outcome, _Unreadable):
-        nothing = Refusal(frame, PixelScale(1.0, 1.0), np.empty((0, 2)), "bad_image", outcome.message)
+        nothing = Refusal(frame, SliceSpots(np.empty((0, 2)), PixelScale(1.0, 1.0)), "bad_image", outcome.message)
         record |= diagnostics(nothing, "configured", 0.0)
         record |= {"pixel_spacing_x_mm": None, "pixel_spacing_y_mm": None, "message": outcome.message}
         result: Registration | Refusal = nothing

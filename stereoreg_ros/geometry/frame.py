@@ -29,6 +29,8 @@ class Frame:
     the frame's origin; moments w = y x o (n, 3) mm, the Pluecker moment in the paper's order, so that
     y x p = w for every p on the line; lambda_min, lambda_max (n,) mm, the rod's ends as positions along y from o.
 
+    Frames that say the same are equal, also where they were loaded twice.
+
     Raises ValueError on fewer than three rods, names that repeat, ends that coincide or are not finite, and tolerances
     that are negative or infinite.
     """
@@ -45,6 +47,7 @@ class Frame:
     moments: Array = field(init=False)
     lambda_min: Array = field(init=False)
     lambda_max: Array = field(init=False)
+    _said: tuple[object, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         names = tuple(self.line_names)
@@ -100,6 +103,15 @@ class Frame:
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
             object.__setattr__(self, key, value)
+        arrays = (starts, ends, diameters, tolerances)
+        said = (self.name, names, *(array.tobytes() for array in arrays), self.orientation_required)
+        object.__setattr__(self, "_said", said)
+
+    def __eq__(self, other: object) -> bool:
+        return self._said == other._said if isinstance(other, Frame) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._said)
 
     def __len__(self) -> int:
         return len(self.line_names)

@@ -112,13 +112,20 @@ def project(frame: Frame, slice_from_frame: Pose, scale: PixelScale) -> tuple[Ar
 def projection_jacobian(cuts: Cuts, slice_from_frame: Pose, scale: PixelScale) -> tuple[Array, Array]:
     """d pixel / d pose (n, 2, 6) as in `cut_jacobian`, and d pixel / d (sx, sy, shear) (n, 2, 3)."""
     by_pose = scale.inverse_matrix @ cut_jacobian(cuts, slice_from_frame.translation)
-    pixels = scale.to_px(cuts.points_mm)
+    return by_pose, scale_jacobian(scale.to_px(cuts.points_mm), scale)
+
+
+def scale_jacobian(pixels: Array, scale: PixelScale) -> Array:
+    """d pixel / d (sx, sy, shear), (..., 2, 3), of slice points that lie at pixels (..., 2).
+
+    S Q = p: where S grows by dS, Q moves by -S^-1 dS Q.
+    """
     u, v = pixels[..., 0], pixels[..., 1]
     by_matrix = np.zeros((*pixels.shape, 3))
     by_matrix[..., 0, 0] = u
     by_matrix[..., 1, 1] = v
     by_matrix[..., 0, 2] = v
-    return by_pose, -scale.inverse_matrix @ by_matrix
+    return np.asarray(-scale.inverse_matrix @ by_matrix)
 
 
 def point_line_distances(frame: Frame, lines: NDArray[np.intp], slice_from_frame: Pose, points_mm: Array) -> Array:

@@ -25,7 +25,6 @@ from stereoreg_ros.matching.significance import (
     share_of,
 )
 from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.options import RegistrationOptions
 
 # Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
 GATE = 18.4
@@ -40,8 +39,6 @@ _SAME_OPTIMUM = 0.1
 _LEAST_SHARE = 1e-3
 # So far behind the best one (log-likelihood) an explanation is forgotten.
 _FAR_BEHIND = 30.0
-# Explanations are never held to be told apart by less than this many decades of likelihood.
-_LEAST_DECADES_APART = 1.0
 # By how much (log-likelihood) `evidence` may prefer an explanation of fewer rods more than `score` does: where the pose
 # adapts to a spot in one direction, by ten times the spot's uncertainty.
 EVIDENCE_SLACK = 2.5
@@ -206,19 +203,10 @@ def _widened(hypothesis: Hypothesis, other: Hypothesis, difference: Array, gains
     return replace(hypothesis, information=information, is_widened=True)
 
 
-def decades_apart(options: RegistrationOptions) -> float:
-    """By how many decades of likelihood explanations must differ to count as told apart.
-
-    Half of those by which chance must be ruled out, a thousand to one by default: who wants more certainty of the one
-    kind wants more of the other.
-    """
-    return max(-options.max_log10_false_alarms / 2, _LEAST_DECADES_APART)
-
-
 def judged(found: list[Hypothesis], spots: Spots, frame: Frame, prior: Prior, apart: float) -> list[Hypothesis]:
     """Of distinct explanations, best first, those that the best one does not rule out, with their false alarms.
 
-    apart: see `decades_apart`.
+    apart: see `Problem.decades_apart`.
 
     They must come near the best one in evidence; of fewer rods, also in how rare they are by chance: from a few spots
     of the frame's own, chance soon makes a match of one or two rods less. Of as many rods they are rivals however lucky

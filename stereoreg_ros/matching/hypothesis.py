@@ -49,8 +49,10 @@ class Found:
 
     hypotheses: the explanations that the best one does not rule out, best first; none where there is none.
     least_rods: explanations of fewer rods were not sought. given_up: why the search was ended early, else empty.
+    is_near: whether only poses near the guess were sought.
     """
 
     hypotheses: list[Hypothesis]
     least_rods: int
     given_up: str = ""
+    is_near: bool = False

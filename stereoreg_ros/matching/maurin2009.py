@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from itertools import combinations, permutations
 from typing import Final, NamedTuple
 
@@ -17,14 +18,14 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import cut
-from stereoreg_ros.matching.consensus import count_missing, decades_apart, distinct, judged
-from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
-from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.spots import Spots, whitening_of
+from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.matching.consensus import distinct, judged
+from stereoreg_ros.matching.hypothesis import UNMATCHED, Found
+from stereoreg_ros.matching.problem import Problem
+from stereoreg_ros.matching.settling import hypotheses_of, refine_matches
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION, POSE_RANK, assemble, condition_number
 from stereoreg_ros.solvers.ls_tz import solve_system
-from stereoreg_ros.solvers.maximum_likelihood import refine
 
 SAMPLE: Final = 4
 # The collinearity constraint s_c: sine of the smallest angle that a triangle of spots may have.
@@ -107,45 +108,36 @@ def search(
     return Search(ranked, drawn, planned, time.perf_counter() - started)
 
 
-def match(spots: Spots, frame: Frame, prior: Prior, options: RegistrationOptions) -> Found:
-    """Explanations by the paper's search, refined and judged, best first; none where no sample qualified.
+class Maurin2009:
+    """The paper's matcher of one frame; it needs no tables."""
 
-    Same form as `matching.three_line.match`. Being random, it may miss what is there.
-    """
-    result = search(spots.mm, frame, PREDICTION_SPREAD * spots.sigma_mm)
-    starts = [(one.frame_from_slice.inverse(), _one_to_one(one, frame, spots.mm)) for one in result.qualified]
-    starts = [start for start in starts if (start[1] != UNMATCHED).sum() >= options.min_inliers]
-    if not starts:
-        return Found([], SAMPLE + 1)
-    spot_of_line = np.array([assigned for _, assigned in starts])
-    rotations = np.array([start.rotation for start, _ in starts])
-    translations = np.array([start.translation for start, _ in starts])
-    used = spot_of_line != UNMATCHED
-    cuts = cut(frame, rotations, translations)
-    refined = refine(
-        frame,
-        rotations,
-        translations,
-        spots.mm[spot_of_line],
-        used,
-        whitening_of(spots.match_covariances(frame, cuts, spot_of_line)),
-        common=spots.common(frame, cuts, spot_of_line, used),
-    )
-    kept = refined.converged & (prior.angles(refined.rotations) <= prior.max_rotation)
-    missing = count_missing(spots, frame, refined.cuts, spot_of_line)
-    found = [
-        Hypothesis(
-            refined.rotations[i],
-            refined.translations[i],
-            spot_of_line[i],
-            float(refined.chi_square[i]),
-            refined.information[i],
-            int(missing[i]),
-        )
-        for i in np.flatnonzero(kept)
-    ]
-    found = distinct(found, spots.gains(frame))
-    return Found(judged(found, spots, frame, prior, decades_apart(options)), SAMPLE + 1)
+    follows_guess: Final = False
+
+    def __init__(self, frame: Frame) -> None:
+        self.frame = frame
+
+    def match(self, problem: Problem) -> Found:
+        """Explanations by the paper's search, refined and judged, best first; none where no sample qualified.
+
+        Being random, it may miss what is there.
+        """
+        spots, frame = problem.spots, problem.frame
+        result = search(spots.mm, frame, PREDICTION_SPREAD * spots.sigma_mm)
+        starts = [(one.frame_from_slice.inverse(), _one_to_one(one, frame, spots.mm)) for one in result.qualified]
+        starts = [start for start in starts if (start[1] != UNMATCHED).sum() >= problem.min_inliers]
+        if not starts:
+            return Found([], SAMPLE + 1)
+        spot_of_line = np.array([assigned for _, assigned in starts])
+        rotations = np.array([start.rotation for start, _ in starts])
+        translations = np.array([start.translation for start, _ in starts])
+        refined = refine_matches(spots, frame, (rotations, translations), spot_of_line)
+        kept = refined.converged & (problem.prior.angles(refined.rotations) <= problem.prior.max_rotation)
+        found = distinct(hypotheses_of(spots, frame, refined.take(kept), spot_of_line[kept]), problem.gains)
+        return Found(judged(found, spots, frame, problem.prior, problem.decades_apart), SAMPLE + 1)
+
+    def preparation(self, scale: PixelScale, options: RegistrationOptions) -> Iterator[None]:
+        """Nothing has to be prepared."""
+        return iter(())
 
 
 def _has_collinear_triple(four: Array, smallest_sine: float) -> bool:

@@ -20,8 +20,8 @@ from stereoreg_ros.geometry.visibility import may_show
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE, MISSING_COST, SHARED_SPOT_MM, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.spots import Spots, whitening_of
-from stereoreg_ros.solvers.maximum_likelihood import refine
+from stereoreg_ros.matching.settling import refine_matches
+from stereoreg_ros.matching.spots import Spots
 
 # Standard deviation of a mistaken spacing along each axis, as a share of it, and the largest that is believed.
 _MISTAKEN, _MOST_MISTAKEN = 0.05, 0.15
@@ -95,10 +95,7 @@ def _best_of(
     rotations = np.tile(best.rotation, (len(used), 1, 1))
     translations = np.tile(best.translation, (len(used), 1))
     for _ in range(_ROUNDS):
-        cuts = cut(frame, rotations, translations)
-        whitening = whitening_of(free.match_covariances(frame, cuts, spot_of_line))
-        common = free.common(frame, cuts, spot_of_line, used)
-        refined = refine(frame, rotations, translations, free.mm[spot_of_line], used, whitening, common=common)
+        refined = refine_matches(free, frame, (rotations, translations), spot_of_line)
         rotations, translations = refined.rotations, refined.translations
     fits = (may_show(frame, refined.cuts) | ~used).all(axis=1) & (
         refined.chi_square <= chi2.isf(IMPLAUSIBLE, 2 * used.sum(axis=1) - 6)
@@ -133,7 +130,7 @@ def _evidence(
 def _scale_errors(spots: Spots, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> Array:
     """The likeliest errors (m, 2) of the scale along x and y, as shares of it, at the likeliest poses."""
     used = (spot_of_line != UNMATCHED)[..., None, None]
-    residual = whitening_of(spots.match_covariances(frame, cuts, spot_of_line)) @ np.where(
+    residual = spots.whitening(frame, cuts, spot_of_line) @ np.where(
         used, (spots.mm[spot_of_line] - cuts.points_mm)[..., None], 0.0
     )
     shared = _shared(spots, frame, cuts, spot_of_line)
@@ -147,5 +144,5 @@ def _shared(spots: Spots, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.int
     """Errors that spots share (m, 2n, c) in standard deviations of each spot, see `Tolerances.common`."""
     used = spot_of_line != UNMATCHED
     moved = spots.tolerances.common(frame, cuts, spots.mm[spot_of_line], used)
-    whitened = whitening_of(spots.match_covariances(frame, cuts, spot_of_line)) @ moved
+    whitened = spots.whitening(frame, cuts, spot_of_line) @ moved
     return np.asarray(np.where(used[..., None, None], whitened, 0.0).reshape(len(used), -1, moved.shape[-1]))

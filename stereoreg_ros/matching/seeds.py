@@ -14,8 +14,10 @@ from stereoreg_ros.geometry.visibility import END_SLACK_MM, LEAST_COSINE, SURE_M
 from stereoreg_ros.matching.consensus import GATE, MISSING_COST
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.problem import Problem
 from stereoreg_ros.matching.spots import Spots
-from stereoreg_ros.solvers.three_rods import PAIRS, Seeds, ThreeLineSolver
+from stereoreg_ros.solvers.distance_equations import PAIRS
+from stereoreg_ros.solvers.three_rods import Seeds, ThreeRodSolver
 
 # A seed's prediction is of first order only: its gate need but let the right spot through.
 _SEED_GATE = 2 * GATE
@@ -133,22 +135,15 @@ class SeedSearch(NamedTuple):
         return leads
 
 
-def search_seeds(
-    spots: Spots,
-    frame: Frame,
-    solver: ThreeLineSolver,
-    rods_cut: tuple[int, int],
-    prior: Prior,
-    min_inliers: int,
-) -> SeedSearch:
+def search_seeds(problem: Problem, solver: ThreeRodSolver, rods_cut: tuple[int, int]) -> SeedSearch:
     """The seeds of the solver's rods within the prior, and what they hit.
 
-    rods_cut: only where a slice may cut so many rods, at least and at most.
-
-    Only seeds that hit enough for a consensus of `min_inliers` rods are kept.
+    rods_cut: only where a slice may cut so many rods, at least and at most. Only seeds that hit enough for a consensus
+    of the fewest rods are kept.
     """
+    spots, frame, prior = problem.spots, problem.frame, problem.prior
     lines = list(solver.lines)
-    others = np.array([line for line in range(len(frame)) if line not in lines])
+    others = _others(frame, solver)
     table = solver.table(*rods_cut)
     cells = None if prior.max_rotation >= np.pi else solver.cells_near(prior.normal, prior.seed_angle)
     triples, distances = spot_triples(spots.mm, lines, table.low, table.high, prior)
@@ -163,9 +158,14 @@ def search_seeds(
             own_spots, seeds = own_spots[:, near], seeds.take(near)
         predicted = _predict(spots, frame, solver, others, own_spots, seeds)
         hits = _hits(spots, stripes, predicted, own_spots, others, prior)
-        tried = triples[:, part].shape[1]
-        pieces.append(_kept(spots, frame, solver, others, own_spots, seeds, predicted.sure, hits, tried, min_inliers))
+        kept = _kept(problem, solver, own_spots, seeds, predicted.sure, hits)
+        pieces.append(kept._replace(triples=triples[:, part].shape[1]))
     return _merged(pieces)
+
+
+def _others(frame: Frame, solver: ThreeRodSolver) -> NDArray[np.intp]:
+    """The rods that are not the solver's."""
+    return np.array([line for line in range(len(frame)) if line not in solver.lines])
 
 
 def spot_triples(
@@ -236,7 +236,7 @@ class _Prediction(NamedTuple):
 def _predict(
     spots: Spots,
     frame: Frame,
-    solver: ThreeLineSolver,
+    solver: ThreeRodSolver,
     others: NDArray[np.intp],
     own_spots: NDArray[np.intp],
     seeds: Seeds,
@@ -354,18 +354,15 @@ def _hits(
 
 
 def _kept(
-    spots: Spots,
-    frame: Frame,
-    solver: ThreeLineSolver,
-    others: NDArray[np.intp],
+    problem: Problem,
+    solver: ThreeRodSolver,
     own_spots: NDArray[np.intp],
     seeds: Seeds,
     sure: NDArray[np.bool_],
     hits: _Hits,
-    triples: int,
-    min_inliers: int,
 ) -> SeedSearch:
     """The seeds that hit enough rods, with their hits in order."""
+    frame, min_inliers, others = problem.frame, problem.min_inliers, _others(problem.frame, solver)
     gate = np.full((own_spots.shape[1], len(others)), np.inf)
     gate[hits.seed, hits.other] = hits.area
     is_hit = np.isfinite(gate)
@@ -382,7 +379,7 @@ def _kept(
     nearest_squared = np.full((len(rows), len(others)), np.inf)
     nearest_squared[hit_seed[farthest_first], hits.other[farthest_first]] = hits.squared[farthest_first]
     return SeedSearch(
-        *solver.poses(seeds.lambdas[rows], spots.mm[own_spots[:, rows].T]),
+        *solver.poses(seeds.lambdas[rows], problem.spots.mm[own_spots[:, rows].T]),
         spot_of_line,
         hit_seed,
         hit_line,
@@ -393,7 +390,7 @@ def _kept(
         nearest_squared,
         reach[rows],
         (sure.T[rows] & ~is_hit[rows]).sum(axis=1),
-        triples,
+        0,
     )
 
 

@@ -12,7 +12,7 @@ from stereoreg_ros.geometry.visibility import may_show
 from stereoreg_ros.matching.consensus import GATE, count_missing
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.seeds import Starts
-from stereoreg_ros.matching.spots import Spots, whitening_of
+from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
 
 _ROUNDS = 4
@@ -26,7 +26,7 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
     """Refine, match all rods to the spots they predict, and repeat until the matches no longer change."""
     settled: list[Hypothesis] = []
     spot_of_line, origin = start.spot_of_line, start.origin
-    refined = _refine(spots, frame, start.rotations, start.translations, spot_of_line, _FIRST_STEPS)
+    refined = refine_matches(spots, frame, (start.rotations, start.translations), spot_of_line, _FIRST_STEPS)
     for number in range(_ROUNDS):
         assigned = _assign(spots, frame, refined)
         enough = (assigned != UNMATCHED).sum(axis=1) >= min_inliers
@@ -46,7 +46,8 @@ def settle(spots: Spots, frame: Frame, start: Starts, min_inliers: int) -> list[
             place = np.column_stack([10 * refined.rotations[rows].reshape(-1, 9), refined.translations[rows] / 5])
             rows = rows[np.unique(np.column_stack([assigned[rows], np.round(place)]), axis=0, return_index=True)[1]]
         spot_of_line, origin = assigned[rows], origin[rows]
-        refined = _refine(spots, frame, refined.rotations[rows], refined.translations[rows], spot_of_line, _STEPS)
+        poses = refined.rotations[rows], refined.translations[rows]
+        refined = refine_matches(spots, frame, poses, spot_of_line)
     return settled
 
 
@@ -56,7 +57,7 @@ def settle_as_matched(spots: Spots, frame: Frame, start: Starts) -> list[Hypothe
     Where few matches leave the pose open, a rod without a spot takes that of another rod, however far off; what
     `settle` comes to then is another explanation.
     """
-    refined = _refine(spots, frame, start.rotations, start.translations, start.spot_of_line, _STEPS)
+    refined = refine_matches(spots, frame, (start.rotations, start.translations), start.spot_of_line)
     polished = _polished(spots, frame, refined, start.spot_of_line)
     unmatched = start.spot_of_line == UNMATCHED
     shown = (may_show(frame, refined.cuts) | unmatched).all(axis=1)
@@ -70,29 +71,35 @@ def _polished(spots: Spots, frame: Frame, refined: Refined, spot_of_line: NDArra
     """
     if not len(spot_of_line):
         return []
-    polished = _refine(spots, frame, refined.rotations, refined.translations, spot_of_line, _FIRST_STEPS)
-    missing = count_missing(spots, frame, polished.cuts, spot_of_line)
+    poses = refined.rotations, refined.translations
+    return hypotheses_of(spots, frame, refine_matches(spots, frame, poses, spot_of_line, _FIRST_STEPS), spot_of_line)
+
+
+def hypotheses_of(spots: Spots, frame: Frame, refined: Refined, spot_of_line: NDArray[np.intp]) -> list[Hypothesis]:
+    """One explanation for each of m refined poses with their matches (m, n)."""
+    missing = count_missing(spots, frame, refined.cuts, spot_of_line)
     return [
         Hypothesis(
-            polished.rotations[i],
-            polished.translations[i],
+            refined.rotations[i],
+            refined.translations[i],
             spot_of_line[i],
-            float(polished.chi_square[i]),
-            polished.information[i],
+            float(refined.chi_square[i]),
+            refined.information[i],
             int(missing[i]),
         )
         for i in range(len(spot_of_line))
     ]
 
 
-def _refine(
-    spots: Spots, frame: Frame, rotations: Array, translations: Array, spot_of_line: NDArray[np.intp], steps: int
+def refine_matches(
+    spots: Spots, frame: Frame, poses: tuple[Array, Array], spot_of_line: NDArray[np.intp], steps: int = _STEPS
 ) -> Refined:
+    """Refine poses slice_from_frame (m, 3, 3), (m, 3) mm to matches (m, n), weighed as they are where they start."""
     used = spot_of_line != UNMATCHED
-    cuts = cut(frame, rotations, translations)
-    whitening = whitening_of(spots.match_covariances(frame, cuts, spot_of_line))
+    cuts = cut(frame, *poses)
     common = spots.common(frame, cuts, spot_of_line, used)
-    return refine(frame, rotations, translations, spots.mm[spot_of_line], used, whitening, steps, common)
+    whitening = spots.whitening(frame, cuts, spot_of_line)
+    return refine(frame, *poses, spots.mm[spot_of_line], used, whitening, steps, common)
 
 
 def _assign(spots: Spots, frame: Frame, refined: Refined) -> NDArray[np.intp]:

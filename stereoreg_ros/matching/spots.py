@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import Cuts
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.matching.significance import area_of_uniform_mm2
 from stereoreg_ros.matching.tolerances import Tolerances
 
@@ -37,6 +38,18 @@ class Streaks(NamedTuple):
     along_mm: Array
     cut_short: NDArray[np.bool_]
     thickness_mm: float
+
+    @classmethod
+    def of(cls, spots: SliceSpots, thickness_mm: float) -> Streaks | None:
+        """Those of the spots of a slice so thick; None where thickness or extents are not known.
+
+        A uniform streak has a twelfth of its squared length as second moment.
+        """
+        if thickness_mm <= 0 or np.isnan(spots.extents_px2).any():
+            return None
+        values, vectors = np.linalg.eigh(spots.scale.matrix @ spots.extents_px2 @ spots.scale.matrix.T)
+        length_mm = np.sqrt(12 * np.maximum(values[:, 1] - values[:, 0], 0.0))
+        return cls(length_mm[:, None] * vectors[:, :, 1], spots.cut_short, thickness_mm)
 
     def allow(self, frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
         """Whether each spot (..., n, s) may be that of each rod, by its length and, of long ones, its direction.
@@ -128,6 +141,10 @@ class Spots(NamedTuple):
         """
         covariances: Array = self.covariances_mm2[spot_of_line] + self.tolerances.rod_covariances(frame, cuts)
         return covariances
+
+    def whitening(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp]) -> Array:
+        """What turns each rod's residual in mm into one of unit variance, (..., n, 2, 2) 1/mm."""
+        return whitening_of(self.match_covariances(frame, cuts, spot_of_line))
 
     def common(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp], used: NDArray[np.bool_]) -> Array | None:
         """Errors that spots share, as `solvers.maximum_likelihood.refine` takes them; None where there are none."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,8 @@ def true_scene(
     false = _uniform(rng, int(rng.integers(most_false + 1)), around.scanner)
     configured = frame if stated_mm is None else with_tolerance(frame, stated_mm)
     options = {} if stated_scale is None else {"scale_tolerance": stated_scale}
-    return _scene(rng, spots[kept], rods[kept], false, configured, around, pose, true_frame, options=options)
+    scene = _scene(rng, _Drawn(spots[kept], rods[kept], false), configured, around, pose, true_frame)
+    return _with_options(scene, options)
 
 
 def contradicted_prior(rng: np.random.Generator, frame: Frame, around: Surroundings, *, turn_deg: float) -> Scene:
@@ -106,7 +107,7 @@ def contradicted_prior(rng: np.random.Generator, frame: Frame, around: Surroundi
     nominal = centred_pose(frame, around.scanner, rotation=rotation)
     pose = _random_pose(rng, frame, around.scanner, nominal)
     spots, rods = _spots(rng, frame, pose, around.scanner.scale)
-    return _scene(rng, spots, rods, _none(), frame, replace(around, max_rotation_deg=30.0), pose, frame)
+    return _scene(rng, _Drawn(spots, rods), frame, replace(around, max_rotation_deg=30.0), pose, frame)
 
 
 def wrong_spacing(
@@ -129,7 +130,7 @@ def wrong_spacing(
     middle_mm = pose @ _middle(frame)
     shift = np.append(scale.to_mm(true_scale.to_px(middle_mm[:2])) - middle_mm[:2], 0.0)
     seen = Pose(pose.rotation, pose.translation + shift)
-    return _scene(rng, spots, rods, _none(), frame, around, seen, frame, scale=scale)
+    return _scene(rng, _Drawn(spots, rods), frame, _with_scale(around, scale), seen, frame)
 
 
 def scale_within_tolerance(
@@ -146,7 +147,8 @@ def scale_within_tolerance(
     true_frame = with_rod_ends_off(rng, frame, rod_ends_mm) if rod_ends_mm else frame
     spots, rods = _spots(rng, true_frame, pose, true_scale)
     configured, options = with_tolerance(frame, rod_ends_mm), {"scale_tolerance": std}
-    return _scene(rng, spots, rods, _none(), configured, around, pose, true_frame, scale=scale, options=options)
+    scene = _scene(rng, _Drawn(spots, rods), configured, _with_scale(around, scale), pose, true_frame)
+    return _with_options(scene, options)
 
 
 def mirrored_rod(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Scene:
@@ -155,7 +157,7 @@ def mirrored_rod(rng: np.random.Generator, frame: Frame, around: Surroundings) -
     rod = int(rng.choice(np.flatnonzero(lean >= min(_LEANING_MM, lean.max()))))
     pose = _pose_within_prior(rng, frame, around)
     spots, rods = _spots(rng, frame, pose, around.scanner.scale)
-    return _scene(rng, spots, rods, _none(), with_rod_mirrored(frame, rod), around, pose, frame)
+    return _scene(rng, _Drawn(spots, rods), with_rod_mirrored(frame, rod), around, pose, frame)
 
 
 def helical(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Scene:
@@ -168,7 +170,7 @@ def helical(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Sce
     # A point p is seen at p where its z is on the sloping plane: shear z away, then cut by z = 0.
     sheared = _sheared(frame, pose, HELICAL_SLOPE, half)
     spots, rods = _spots(rng, sheared, Pose.identity(), around.scanner.scale)
-    return _scene(rng, spots, rods, _none(), frame, around, pose, frame)
+    return _scene(rng, _Drawn(spots, rods), frame, around, pose, frame)
 
 
 def template(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Scene:
@@ -185,7 +187,7 @@ def template(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Sc
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     middle = 0.5 * around.scanner.size_mm + rng.uniform(-_OFFSET_MM, _OFFSET_MM, 2)
     spots = around.scanner.scale.to_px(chosen @ rotation.T + middle) + rng.normal(0.0, NOISE_PX, chosen.shape)
-    return _scene(rng, _none(), np.empty(0, np.intp), spots, frame, around, None, None)
+    return _scene(rng, _Drawn(np.empty((0, 2)), np.empty(0, np.intp), spots), frame, around, None, None)
 
 
 def sister(rng: np.random.Generator, frame: Frame, around: Surroundings, *, missing: int = 0) -> Scene:
@@ -210,7 +212,7 @@ def sister(rng: np.random.Generator, frame: Frame, around: Surroundings, *, miss
         left, right = (spots, others) if sides[0] < sides[1] else (others, spots)
         if left[:, 0].max() + 10 < right[:, 0].min():
             kept = rng.permutation(len(spots))[missing:]
-            return _scene(rng, spots[kept], rods[kept], others, frame, wide, pose, frame)
+            return _scene(rng, _Drawn(spots[kept], rods[kept], others), frame, wide, pose, frame)
     raise ValueError(f"frame '{frame.name}': no two poses found that do not overlap")
 
 
@@ -236,7 +238,8 @@ def fragments(
     spots = (centres[:, None] + offset).reshape(-1, 2)
     spots += rng.normal(0.0, NOISE_PX, spots.shape)
     previous = _near(rng, pose, frame, rng.uniform(1.0, 2.0), 1.0) if with_previous else None
-    return _scene(rng, spots, np.repeat(rods, count), _none(), frame, around, pose, frame, previous=previous)
+    scene = _scene(rng, _Drawn(spots, np.repeat(rods, count)), frame, around, pose, frame)
+    return replace(scene, previous=previous)
 
 
 def collinear(rng: np.random.Generator, frame: Frame, around: Surroundings, *, missing: int = 0) -> Scene:
@@ -252,7 +255,7 @@ def collinear(rng: np.random.Generator, frame: Frame, around: Surroundings, *, m
     clutter = clutter[((clutter >= 0) & (clutter < scanner.shape[::-1])).all(axis=1)]
     clutter += rng.normal(0.0, NOISE_PX, clutter.shape)
     kept = rng.permutation(len(spots))[missing:]
-    return _scene(rng, spots[kept], rods[kept], clutter, frame, around, pose, frame)
+    return _scene(rng, _Drawn(spots[kept], rods[kept], clutter), frame, around, pose, frame)
 
 
 def with_rod_ends_off(rng: np.random.Generator, frame: Frame, std_mm: float) -> Frame:
@@ -261,18 +264,15 @@ def with_rod_ends_off(rng: np.random.Generator, frame: Frame, std_mm: float) -> 
     return replace(frame, starts=frame.starts + errors[0], ends=frame.ends + errors[1])
 
 
-@lru_cache(maxsize=256)
 def with_tolerance(frame: Frame, tolerance_mm: float) -> Frame:
-    """The frame with this tolerance of all its rods; the same object for the same arguments."""
+    """The frame with this tolerance of all its rods."""
     return replace(frame, tolerances_mm=np.full(len(frame), tolerance_mm))
 
 
-@lru_cache(maxsize=256)
 def with_rod_mirrored(frame: Frame, rod: int) -> Frame:
     """The frame with a rod (row) that leans the other way: its ends change places along x or y, not in height.
 
-    It is the axis along which they are farther apart. The same arguments give the same object, as tables are kept by
-    frame.
+    It is the axis along which they are farther apart.
     """
     starts, ends = frame.starts.copy(), frame.ends.copy()
     axis = int(np.abs(frame.ends - frame.starts)[rod, :2].argmax())
@@ -280,31 +280,37 @@ def with_rod_mirrored(frame: Frame, rod: int) -> Frame:
     return replace(frame, name=f"{frame.name}, {frame.line_names[rod]} mirrored", starts=starts, ends=ends)
 
 
+class _Drawn(NamedTuple):
+    """Spots (k, 2) of rods whose rows are (k,), and false ones (f, 2), in pixel."""
+
+    spots: Array
+    rods: NDArray[np.intp]
+    false: Array = np.empty((0, 2))
+
+
 def _scene(
     rng: np.random.Generator,
-    spots: Array,
-    rods: NDArray[np.intp],
-    false: Array,
+    drawn: _Drawn,
     frame: Frame,
     around: Surroundings,
     truth: Pose | None,
     true_frame: Frame | None,
-    *,
-    scale: PixelScale | None = None,
-    options: dict[str, float] | None = None,
-    previous: Pose | None = None,
 ) -> Scene:
-    scale = scale or around.scanner.scale
-    every = np.concatenate([spots, false])
-    made_by = np.concatenate([rods, np.full(len(false), NO_ROD)])
+    scale = around.scanner.scale
+    every = np.concatenate([drawn.spots, drawn.false])
+    made_by = np.concatenate([drawn.rods, np.full(len(drawn.false), NO_ROD)])
     order = rng.permutation(len(every))
     area = float(np.prod(around.scanner.shape)) * scale.sx * scale.sy
-    chosen = {"max_rotation_deg": around.max_rotation_deg, **(options or {})}
-    return Scene(every[order], made_by[order], frame, scale, chosen, area, previous, truth, true_frame)
+    options = {"max_rotation_deg": around.max_rotation_deg}
+    return Scene(every[order], made_by[order], frame, scale, options, area, None, truth, true_frame)
 
 
-def _none() -> Array:
-    return np.empty((0, 2))
+def _with_options(scene: Scene, options: dict[str, float]) -> Scene:
+    return replace(scene, options={**scene.options, **options})
+
+
+def _with_scale(around: Surroundings, scale: PixelScale) -> Surroundings:
+    return replace(around, scanner=replace(around.scanner, scale=scale))
 
 
 def _uniform(rng: np.random.Generator, count: int, scanner: ScannerSettings) -> Array:

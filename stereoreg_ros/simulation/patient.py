@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -49,7 +50,7 @@ def background(shape: tuple[int, int], scale: PixelScale, body: bool) -> NDArray
     image = np.full(shape, AIR_HU, dtype=np.float32)
     if body:
         for ellipse in (*_BODY, *_ribs()):
-            _paint_ellipse(image, *ellipse, scale)
+            _paint_ellipse(image, ellipse, scale)
     image.setflags(write=False)
     return image
 
@@ -66,16 +67,8 @@ def _ribs() -> list[tuple[float, float, float, float, float, float]]:
     return ribs
 
 
-def _paint_ellipse(
-    image: NDArray[np.float32],
-    x: float,
-    y: float,
-    half_x: float,
-    half_y: float,
-    tilt_deg: float,
-    hu: float,
-    scale: PixelScale,
-) -> None:
+def _paint_ellipse(image: NDArray[np.float32], ellipse: Sequence[float], scale: PixelScale) -> None:
+    x, y, half_x, half_y, tilt_deg, hu = ellipse
     rows, columns = image.shape
     width, height = columns * scale.sx, rows * scale.sy
     a, b = half_x * width, half_y * height

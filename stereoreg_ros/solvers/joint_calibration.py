@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, rotation_exp
-from stereoreg_ros.geometry.projection import cut, cut_jacobian
+from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers.identified import IdentifiedSpots, Linearised, ScaleAndPoses, linearised
 
 _ITERATIONS = 60
 _STILL = 1e-12
@@ -21,54 +20,47 @@ _FIRST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e10
 class JointScale:
     """A pixel scale with the poses of m slices.
 
-    scale: mm/pixel; covariance: (2, 2) of (sx, sy), or (3, 3) with the shear, mm^2/pixel^2, for the spots' covariances;
-    rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame; residuals_px: (m, n, 2), spot less prediction, zero
-    where a rod has no spot; chi_square, degrees_of_freedom: of all residuals together; converged.
+    at: scale and poses; covariance: (2, 2) of (sx, sy), or (3, 3) with the shear, mm^2/pixel^2, for the spots'
+    covariances; residuals_px: (m, n, 2), spot less prediction, zero where a rod has no spot; chi_square,
+    degrees_of_freedom: of all residuals together; converged.
     """
 
-    scale: PixelScale
+    at: ScaleAndPoses
     covariance: Array
-    rotations: Array
-    translations: Array
     residuals_px: Array
     chi_square: float
     degrees_of_freedom: int
     converged: bool
 
+    @property
+    def scale(self) -> PixelScale:
+        """mm/pixel."""
+        return self.at.scale
+
 
 def calibrate_jointly(
-    frame: Frame,
-    rotations: Array,
-    translations: Array,
-    spots_px: Array,
-    used: NDArray[np.bool_],
-    covariances_px2: Array,
-    scale: PixelScale,
-    with_shear: bool = False,
+    frame: Frame, identified: IdentifiedSpots, start: ScaleAndPoses, with_shear: bool = False
 ) -> JointScale:
     """Least squares of the whitened residuals in the image over the scale and the poses of m slices, n rods.
 
-    rotations (m, 3, 3), translations (m, 3) mm, scale: where to start. spots_px (m, n, 2): the spot of each rod,
-    covariances_px2 (m, n, 2, 2): of their centres; anything where used (m, n) is false. The poses are eliminated from
-    the normal equations slice by slice (Schur complement), so that the work grows with m and not with its cube.
+    The poses are eliminated from the normal equations slice by slice (Schur complement), so that the work grows with m
+    and not with its cube.
     """
     size = 3 if with_shear else 2
-    whitening = _inverse(np.linalg.cholesky(np.where(used[..., None, None], covariances_px2, np.eye(2))))
-    target = np.where(used[..., None], spots_px, 0.0)
-    state = _evaluate(frame, rotations, translations, target, used, whitening, scale, size)
+    whitening = identified.whitening()
+
+    def evaluated(at: ScaleAndPoses) -> _State:
+        return _State.of(linearised(frame, at, identified, whitening), size)
+
+    at, state = start, evaluated(start)
     damping, converged = _FIRST_DAMPING, False
     for _ in range(_ITERATIONS):
         by_scale, by_pose = state.step(damping)
-        shear = scale.shear + (by_scale[2] if with_shear else 0.0)
-        sx, sy = scale.sx + by_scale[0], scale.sy + by_scale[1]
-        tried = None
-        if min(sx, sy) > 0 and np.isfinite([sx, sy, shear]).all():
-            turned = rotation_exp(by_pose[:, 3:]) @ rotations
-            new = (turned, translations + by_pose[:, :3], PixelScale(float(sx), float(sy), float(shear)))
-            tried = _evaluate(frame, new[0], new[1], target, used, whitening, new[2], size)
-        if tried is not None and tried.chi_square <= state.chi_square:
+        moved = at.moved(np.concatenate([by_scale, np.zeros(3 - size)]), by_pose)
+        tried = None if moved is None else evaluated(moved)
+        if moved is not None and tried is not None and tried.chi_square <= state.chi_square:
             gain = state.chi_square - tried.chi_square
-            (rotations, translations, scale), state, damping = new, tried, 0.1 * damping
+            at, state, damping = moved, tried, 0.1 * damping
             if gain <= _STILL * (1.0 + state.chi_square):
                 converged = True
                 break
@@ -80,10 +72,8 @@ def calibrate_jointly(
     # A direction that nothing determines gets a huge variance, not none.
     values, vectors = np.linalg.eigh(state.reduced()[0])
     covariance: Array = (vectors / np.maximum(values, 1e-12 * max(float(values[-1]), 1e-12))) @ vectors.T
-    freedom = int(2 * used.sum()) - 6 * len(rotations) - size
-    return JointScale(
-        scale, covariance, rotations, translations, state.residuals_px, state.chi_square, freedom, converged
-    )
+    freedom = int(2 * identified.used.sum()) - 6 * len(at.rotations) - size
+    return JointScale(at, covariance, state.residuals_px, state.chi_square, freedom, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +87,22 @@ class _State:
     by_pose: Array
     scale_gradient: Array
     pose_gradient: Array
+
+    @classmethod
+    def of(cls, at: Linearised, size: int) -> _State:
+        """size: how many of (sx, sy, shear) are measured."""
+        scales = at.by_scale[..., :size].reshape(*at.by_pose.shape[:2], size)
+        turned = np.swapaxes(at.by_pose, 1, 2)
+        chi_square = float((at.white**2).sum())
+        return cls(
+            at.residuals_px,
+            chi_square if np.isfinite(chi_square) else float("inf"),
+            (np.swapaxes(scales, 1, 2) @ scales).sum(axis=0),
+            turned @ scales,
+            turned @ at.by_pose,
+            (np.swapaxes(scales, 1, 2) @ at.white)[..., 0].sum(axis=0),
+            (turned @ at.white)[..., 0],
+        )
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
         """Information (q, q) and gradient (q,) of the scale, the poses eliminated; and the poses' inverse blocks."""
@@ -120,42 +126,3 @@ class _State:
 
 def _inverse(matrices: Array) -> Array:
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-
-
-def _evaluate(
-    frame: Frame,
-    rotations: Array,
-    translations: Array,
-    target_px: Array,
-    used: NDArray[np.bool_],
-    whitening: Array,
-    scale: PixelScale,
-    size: int,
-) -> _State:
-    m, n = used.shape
-    cuts = cut(frame, rotations, translations)
-    predicted = scale.to_px(cuts.points_mm)
-    mask = used[..., None]
-    residual = np.where(mask, target_px - predicted, 0.0)
-    # S Q = p: where S grows by dS, Q moves by -S^-1 dS Q.
-    moved = np.zeros((m, n, 2, 3))
-    moved[..., 0, 0] = predicted[..., 0]
-    moved[..., 1, 1] = predicted[..., 1]
-    moved[..., 0, 2] = predicted[..., 1]
-    by_scale = -scale.inverse_matrix @ moved[..., :size]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_pose = scale.inverse_matrix @ cut_jacobian(cuts, translations)
-    white = (whitening @ residual[..., None]).reshape(m, 2 * n, 1)
-    scales = np.where(mask[..., None], whitening @ by_scale, 0.0).reshape(m, 2 * n, size)
-    poses = np.where(mask[..., None], whitening @ by_pose, 0.0).reshape(m, 2 * n, 6)
-    turned = np.swapaxes(poses, 1, 2)
-    chi_square = float((white**2).sum())
-    return _State(
-        residual,
-        chi_square if np.isfinite(chi_square) else float("inf"),
-        (np.swapaxes(scales, 1, 2) @ scales).sum(axis=0),
-        turned @ scales,
-        turned @ poses,
-        (np.swapaxes(scales, 1, 2) @ white)[..., 0].sum(axis=0),
-        (turned @ white)[..., 0],
-    )

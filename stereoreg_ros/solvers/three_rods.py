@@ -1,10 +1,11 @@
 """Three rods and three spots: the least from which a pose follows, in up to eight ways.
 
 Unknown are the positions lambda (3) at which the slice cuts the rods; the three distances between the spots are known.
-Each squared distance is a quadratic in two of them. The rods are divided into cells once; a table from distances to
-cells says which cells a triple of spots can belong to, and a few damped steps from a cell's centre reach the solution
-in it, so that no starting guess is needed. Where noise has pushed a double root off the real axis, as parallel rods and
-a slice at right angles to them make normal, the steps end at the nearest point.
+Each squared distance is a quadratic in two of them (`distance_equations`). The rods are divided into cells once; a
+table from distances to cells (`distance_table`) says which cells a triple of spots can belong to, and a few damped
+steps from a cell's centre reach the solution in it, so that no starting guess is needed. Where noise has pushed a
+double root off the real axis, as parallel rods and a slice at right angles to them make normal, the steps end at the
+nearest point.
 """
 
 from __future__ import annotations
@@ -17,20 +18,16 @@ from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, cross
+from stereoreg_ros.solvers.distance_equations import PAIRS, DistanceEquations
+from stereoreg_ros.solvers.distance_table import DistanceTable
 
-# Pairs of the three rods, in the order of all arrays of three distances.
-PAIRS = ((0, 1), (0, 2), (1, 2))
 _CELLS_PER_ROD = 14
 _STEPS, _SLOW_STEPS = 3, 4
 _SMALL_STEP_MM = 0.01
-# Bins of the table along each of the three distances.
-_BINS = 40
 # How much larger the bounds of a cell's distances are made than those of the points tried in it.
 _MARGIN = 1.05
 # Share of the least cosine that is asked for in the points tried in a cell: between them it may be larger.
 _LOOSENED = 0.8
-# Damping of the steps, in units of squared cosines: reached only where a double root is near.
-_DAMPING = 1e-5
 
 
 class Seeds(NamedTuple):
@@ -49,7 +46,7 @@ class Seeds(NamedTuple):
         return Seeds(self.triples[rows], self.lambdas[rows], self.lambda_covariance[rows])
 
 
-class ThreeLineSolver:
+class ThreeRodSolver:
     """All poses that put three given rods on three given spots."""
 
     def __init__(
@@ -72,18 +69,7 @@ class ThreeLineSolver:
         low, high = frame.lambda_min[rows] - end_slack_mm, frame.lambda_max[rows] + end_slack_mm
         self.lambda_low, self.lambda_high = low, high
         self._cell = (high - low) / _CELLS_PER_ROD
-        # d^2 = la^2 + lb^2 - 2 cosine la lb + 2 at_a la + 2 at_b lb + constant, for each pair of rods.
-        self._quadratics = []
-        for a, b in PAIRS:
-            between = self._origins[a] - self._origins[b]
-            self._quadratics.append(
-                (
-                    float(self._directions[a] @ self._directions[b]),
-                    float(self._directions[a] @ between),
-                    float(-self._directions[b] @ between),
-                    float(between @ between),
-                )
-            )
+        self._equations = DistanceEquations(self._origins, self._directions)
         steps = (np.arange(_CELLS_PER_ROD) + 0.5) / _CELLS_PER_ROD
         axes = [low[i] + (high - low)[i] * steps for i in range(3)]
         self._centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -92,7 +78,7 @@ class ThreeLineSolver:
         self._nearest, self._farthest = nearest - tolerance_mm, farthest + tolerance_mm
         self._box = self._oblique_bounds()
         self._normals, self._normal_spread, self.rods_cut = self._planes(frame, least_cosine)
-        self._tables: dict[tuple[int, int], _Table] = {}
+        self._tables: dict[tuple[int, int], DistanceTable] = {}
 
     def points(self, lambdas: Array) -> Array:
         """Points (..., 3, 3) mm of the frame at positions (..., 3) mm along the three rods."""
@@ -159,12 +145,12 @@ class ThreeLineSolver:
         near: NDArray[np.bool_] = between <= angle + self._normal_spread
         return near
 
-    def table(self, least_rods: int, most_rods: int) -> _Table:
+    def table(self, least_rods: int, most_rods: int) -> DistanceTable:
         """From distances to the cells in which a slice may cut so many rods, from the least to the most."""
         key = (least_rods, most_rods)
         if key not in self._tables:
             cells = np.flatnonzero((self.rods_cut >= least_rods) & (self.rods_cut <= most_rods))
-            self._tables[key] = _Table.of(cells, self._nearest[cells], self._farthest[cells])
+            self._tables[key] = DistanceTable.of(cells, self._nearest[cells], self._farthest[cells])
         return self._tables[key]
 
     def _oblique_bounds(self) -> Array:
@@ -186,7 +172,7 @@ class ThreeLineSolver:
         return np.concatenate([factors.reshape(-1, 9), constants], axis=1).astype(np.float32)
 
     def solve(
-        self, distances: NDArray[np.floating[Any]], table: _Table, cells: NDArray[np.bool_] | None = None
+        self, distances: NDArray[np.floating[Any]], table: DistanceTable, cells: NDArray[np.bool_] | None = None
     ) -> Seeds:
         """Positions for triples of spots, by their distances (3, t) mm in the order of PAIRS.
 
@@ -198,7 +184,7 @@ class ThreeLineSolver:
         start = [centre[cell] for centre in self._single_centres]
         known = [distance[triple] for distance in single]
         lambdas = self._stepped(start, known, _STEPS)
-        misfit = np.maximum.reduce([np.abs(error) for error in self._equations(lambdas, known).error])
+        misfit = self._equations.misfits(lambdas, known).largest
         found = misfit <= self.tolerance_mm
         for value, first, size, low, high in zip(
             lambdas, start, self._cell.tolist(), self.lambda_low.tolist(), self.lambda_high.tolist(), strict=True
@@ -208,11 +194,13 @@ class ThreeLineSolver:
         rows = self._distinct(np.flatnonzero(found), triple, lambdas, misfit)
         exact = [distance.astype(np.float64) for distance in distances[:, triple[rows]]]
         ends, are_slow = self._polished([value[rows].astype(np.float64) for value in lambdas], exact)
-        equations = self._equations(ends, exact)
-        seeds = Seeds(triple[rows], np.stack(ends).T, self._covariance(equations, np.maximum.reduce(exact)))
+        misfits = self._equations.misfits(ends, exact)
+        seeds = Seeds(
+            triple[rows], np.stack(ends).T, misfits.covariance(self.tolerance_mm / 4, np.maximum.reduce(exact))
+        )
         if not are_slow:
             return seeds
-        misfit = np.maximum.reduce([np.abs(error) for error in equations.error])
+        misfit = misfits.largest
         found = misfit <= self.tolerance_mm
         for value, low, high in zip(ends, self.lambda_low, self.lambda_high, strict=True):
             found &= (value >= low) & (value <= high)
@@ -239,7 +227,7 @@ class ThreeLineSolver:
         return rotations, flat_centre - np.einsum("mij,mj->mi", rotations, centre)
 
     def _candidates(
-        self, distances: NDArray[np.float32], table: _Table, cells: NDArray[np.bool_] | None
+        self, distances: NDArray[np.float32], table: DistanceTable, cells: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows of triples, in order, and of the cells that their distances (3, t) allow."""
         triple, cell = table.look_up(distances)
@@ -260,7 +248,7 @@ class ThreeLineSolver:
     def _stepped(self, lambdas: list[Any], distances: list[Any], steps: int) -> list[Any]:
         """Positions, three times (c,), after damped Newton steps, none longer than a cell."""
         for _ in range(steps):
-            step = _damped_step(self._equations(lambdas, distances))
+            step = self._equations.misfits(lambdas, distances).step()
             lambdas = [
                 value - np.minimum(np.maximum(change, -size), size)
                 for value, change, size in zip(lambdas, step, self._cell.tolist(), strict=True)
@@ -279,117 +267,6 @@ class ThreeLineSolver:
             for end, value in zip(ends, slow, strict=True):
                 end[rows] = value
         return ends, bool(rows.size)
-
-    def _equations(self, lambdas: list[Array], distances: list[Array]) -> _Equations:
-        """(d^2 - D^2) / 2D for each pair: the distance's error to first order, and smooth where rods meet.
-
-        d^2 is quadratic in the two positions; its coefficients are those of `_quadratics`.
-        """
-        errors, slopes = [], []
-        for (a, b), (cosine, at_a, at_b, constant), known in zip(PAIRS, self._quadratics, distances, strict=True):
-            first, second = lambdas[a], lambdas[b]
-            slope_a = first - cosine * second + at_a
-            slope_b = second - cosine * first + at_b
-            squared = first * (slope_a + at_a) + second * (slope_b + at_b) + constant
-            inverse = 1.0 / known
-            errors.append(0.5 * (squared * inverse - known))
-            slopes.append((slope_a * inverse, slope_b * inverse))
-        return _Equations(errors, slopes)
-
-    def _covariance(self, equations: _Equations, longest: Array) -> Array:
-        """Covariance (m, 3, 3) mm^2 of the positions, for distances known to a quarter of the tolerance.
-
-        At a double root the distance changes only with the square of the position, x^2 / 2D: there a position is known
-        to sqrt(2 D sigma), not to infinity. longest: (m,), of the three distances D.
-        """
-        sigma = self.tolerance_mm / 4
-        inverse, determinant = _inverse_normal(equations, sigma / (2 * longest))
-        xx, yy, zz, xy, xz, yz = (part * (sigma**2 / determinant) for part in inverse)
-        return np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3, -1).transpose(2, 0, 1)
-
-
-class _Table(NamedTuple):
-    """Bins over three distances, each with the cells that can have them.
-
-    low, high (3,): outside of which no cell has a distance, mm; size (3,): of a bin, mm; start: where each bin's cells
-    start in `cell`, and where the last one's end.
-    """
-
-    low: Array
-    high: Array
-    size: Array
-    start: NDArray[np.intp]
-    cell: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, cells: NDArray[np.intp], nearest: Array, farthest: Array) -> _Table:
-        """The table of cells (c,) with the least and greatest of their three distances (c, 3) mm."""
-        if not cells.size:
-            return cls(np.full(3, np.inf), np.full(3, -np.inf), np.ones(3), np.zeros(1, dtype=np.intp), cells)
-        low, high = nearest.min(axis=0), farthest.max(axis=0)
-        size = np.maximum((high - low) / (_BINS - 1), 1e-6)
-        first, last = ((nearest - low) / size).astype(np.intp), ((farthest - low) / size).astype(np.intp)
-        extent = last - first + 1
-        count = extent.prod(axis=1)
-        row, rank = _enumerated(count)
-        x = first[row, 0] + rank % extent[row, 0]
-        y = first[row, 1] + rank // extent[row, 0] % extent[row, 1]
-        z = first[row, 2] + rank // (extent[row, 0] * extent[row, 1])
-        flat = (x * _BINS + y) * _BINS + z
-        order = np.argsort(flat, kind="stable")
-        return cls(low, high, size, np.searchsorted(flat[order], np.arange(_BINS**3 + 1)), cells[row[order]])
-
-    def look_up(self, distances: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows of triples and of cells that share a bin; distances: (3, t) mm."""
-        possible = np.ones(len(distances[0]), dtype=bool)
-        for distance, low, high in zip(distances, self.low.tolist(), self.high.tolist(), strict=True):
-            possible &= (distance >= low) & (distance <= high)
-        rows = np.flatnonzero(possible)
-        x, y, z = (
-            ((distance[rows] - low) / size).astype(np.intp)
-            for distance, low, size in zip(distances, self.low.tolist(), self.size.tolist(), strict=True)
-        )
-        flat = (x * _BINS + y) * _BINS + z
-        start = self.start[flat]
-        row, rank = _enumerated(self.start[flat + 1] - start)
-        return rows[row], self.cell[start[row] + rank]
-
-
-def _enumerated(count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For counts 2, 0, 3: rows 0 0 2 2 2 and ranks 0 1 0 1 2."""
-    row = np.repeat(np.arange(len(count)), count)
-    return row, np.arange(len(row)) - (np.cumsum(count) - count)[row]
-
-
-class _Equations(NamedTuple):
-    """Errors of the three distances, and the derivatives of each by the positions on its two rods."""
-
-    error: list[Array]
-    slope: list[tuple[Array, Array]]
-
-
-def _inverse_normal(equations: _Equations, damping: Array | float) -> tuple[tuple[Array, ...], Array]:
-    """Adjugate (xx, yy, zz, xy, xz, yz) and determinant of J'J + damping, in elements: LAPACK takes far longer."""
-    (a0, b0), (a1, c1), (b2, c2) = equations.slope
-    xx, yy, zz = a0 * a0 + a1 * a1 + damping, b0 * b0 + b2 * b2 + damping, c1 * c1 + c2 * c2 + damping
-    xy, xz, yz = a0 * b0, a1 * c1, b2 * c2
-    cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    cxy, cxz, cyz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    return (cxx, cyy, czz, cxy, cxz, cyz), xx * cxx + xy * cxy + xz * cxz
-
-
-def _damped_step(equations: _Equations) -> tuple[Array, Array, Array]:
-    """(J'J + mu)^-1 J' e."""
-    (a0, b0), (a1, c1), (b2, c2) = equations.slope
-    e0, e1, e2 = equations.error
-    (cxx, cyy, czz, cxy, cxz, cyz), determinant = _inverse_normal(equations, _DAMPING)
-    right_x, right_y, right_z = a0 * e0 + a1 * e1, b0 * e0 + b2 * e2, c1 * e1 + c2 * e2
-    inverse = 1.0 / determinant
-    return (
-        (cxx * right_x + cxy * right_y + cxz * right_z) * inverse,
-        (cxy * right_x + cyy * right_y + cyz * right_z) * inverse,
-        (cxz * right_x + cyz * right_y + czz * right_z) * inverse,
-    )
 
 
 def _triad(triangles: Array) -> Array:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.geometry.pose import Array, rotation_exp
-from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
+from stereoreg_ros.geometry.pose import Array
+from stereoreg_ros.geometry.projection import Cuts
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers.identified import IdentifiedSpots, ScaleAndPoses, linearised
 
 _ITERATIONS = 60
 _STILL = 1e-12
@@ -21,73 +22,55 @@ _FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e10
 class TolerantScale:
     """A pixel scale with the poses of m slices and the rods where they fit best.
 
-    scale: mm/pixel; covariance: (q, q) of as many of (sx, sy, shear) as were measured, mm^2/pixel^2, for the spots'
+    at: scale and poses; covariance: (q, q) of as many of (sx, sy, shear) as were measured, mm^2/pixel^2, for the spots'
     covariances and the rods' tolerances together; frame_covariance: (q, q), the part of it that the rods' tolerances
-    bring; frame: with the rods' ends moved; rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame;
-    residuals_px: (m, n, 2), spot less prediction, zero where a rod has no spot; chi_square, degrees_of_freedom: of all
-    residuals and of the rods' displacements together; converged.
+    bring; frame: with the rods' ends moved; residuals_px: (m, n, 2), spot less prediction, zero where a rod has no
+    spot; chi_square, degrees_of_freedom: of all residuals and of the rods' displacements together; converged.
     """
 
-    scale: PixelScale
+    at: ScaleAndPoses
     covariance: Array
     frame_covariance: Array
     frame: Frame
-    rotations: Array
-    translations: Array
     residuals_px: Array
     chi_square: float
     degrees_of_freedom: int
     converged: bool
 
+    @property
+    def scale(self) -> PixelScale:
+        """mm/pixel."""
+        return self.at.scale
+
 
 def calibrate_tolerantly(
     frame: Frame,
     tolerances_mm: Array,
-    rotations: Array,
-    translations: Array,
-    spots_px: Array,
-    used: NDArray[np.bool_],
-    covariances_px2: Array,
-    scale: PixelScale,
+    identified: IdentifiedSpots,
+    start: ScaleAndPoses,
     measured: int = 2,
 ) -> TolerantScale:
     """Least squares of the whitened residuals over the scale, the poses of m slices and the ends of n rods.
 
     tolerances_mm: (n,), standard deviation per axis of each rod's ends. How far an end is off is the same in every
-    slice: more slices do not average it away. rotations (m, 3, 3), translations (m, 3) mm, scale: where to start, near
-    the solution. spots_px (m, n, 2): the spot of each rod, covariances_px2 (m, n, 2, 2): of their centres; anything
-    where used (m, n) is false. measured: how many of (sx, sy, shear) are unknown, 0, 2 or 3; the others stay.
+    slice: more slices do not average it away. start: near the solution. measured: how many of (sx, sy, shear) are
+    unknown, 0, 2 or 3; the others stay.
     """
-    factors = np.linalg.cholesky(np.where(used[..., None, None], covariances_px2, np.eye(2)))
-    whitening = np.linalg.inv(factors).astype(np.float64, copy=False)
-    target = np.where(used[..., None], spots_px, 0.0)
-    displacements = np.zeros((len(frame), 6))
-
-    def at(scale: PixelScale, rotations: Array, translations: Array, displacements: Array) -> _State:
-        moved = _moved(frame, tolerances_mm, displacements)
-        return _evaluate(
-            moved, tolerances_mm, displacements, rotations, translations, target, used, whitening, scale, measured
-        )
-
-    state = at(scale, rotations, translations, displacements)
+    rods = _LooseRods(frame, tolerances_mm, identified, identified.whitening(), measured)
+    at, displacements = start, np.zeros((len(frame), 6))
+    state = rods.evaluated(at, displacements)
     damping, converged = _FIRST_DAMPING, False
     for _ in range(_ITERATIONS):
         common, by_pose = state.step(damping)
-        by_scale = np.zeros(3)
-        by_scale[:measured] = common[:measured]
-        sx, sy, shear = np.array([scale.sx, scale.sy, scale.shear]) + by_scale
-        tried = None
-        if np.isfinite(common).all() and min(sx, sy) > 0:
-            new = (
-                PixelScale(float(sx), float(sy), float(shear)),
-                rotation_exp(by_pose[:, 3:]) @ rotations,
-                translations + by_pose[:, :3],
-                displacements + common[measured:].reshape(-1, 6),
-            )
-            tried = at(*new)
-        if tried is not None and tried.chi_square <= state.chi_square:
+        moved = tried = None
+        if np.isfinite(common).all():
+            moved = at.moved(np.concatenate([common[:measured], np.zeros(3 - measured)]), by_pose)
+        displaced = displacements + common[measured:].reshape(-1, 6)
+        if moved is not None:
+            tried = rods.evaluated(moved, displaced)
+        if moved is not None and tried is not None and tried.chi_square <= state.chi_square:
             gain = state.chi_square - tried.chi_square
-            (scale, rotations, translations, displacements), state, damping = new, tried, 0.1 * damping
+            at, displacements, state, damping = moved, displaced, tried, 0.1 * damping
             if gain <= _STILL * (1.0 + state.chi_square):
                 converged = True
                 break
@@ -98,15 +81,13 @@ def calibrate_tolerantly(
                 break
     covariance, frame_covariance = state.covariances(measured)
     return TolerantScale(
-        scale,
+        at,
         covariance,
         frame_covariance,
-        _moved(frame, tolerances_mm, displacements),
-        rotations,
-        translations,
+        rods.displaced(displacements),
         state.residuals_px,
         state.chi_square,
-        int(2 * used.sum()) - 6 * len(rotations) - measured,
+        int(2 * identified.used.sum()) - 6 * len(at.rotations) - measured,
         converged,
     )
 
@@ -160,12 +141,6 @@ class _State:
         return covariance, between @ between.T
 
 
-def _moved(frame: Frame, tolerances_mm: Array, displacements: Array) -> Frame:
-    """The frame with its rods' ends displaced by (n, 6), start then end, in units of their tolerances."""
-    off_mm = tolerances_mm[:, None] * displacements
-    return replace(frame, starts=frame.starts + off_mm[:, :3], ends=frame.ends + off_mm[:, 3:])
-
-
 def _by_ends(frame: Frame, cuts: Cuts, rotations: Array) -> Array:
     """d points_mm / d (start, end), (m, n, 2, 6), of each rod in the frame's axes."""
     # A point of the rod that moves by dp moves the cut by dp_xy - slope dp_z: the rod slides through the plane.
@@ -177,49 +152,43 @@ def _by_ends(frame: Frame, cuts: Cuts, rotations: Array) -> Array:
     return np.concatenate([(1.0 - along) * by_point, along * by_point], axis=-1)
 
 
-def _evaluate(
-    frame: Frame,
-    tolerances_mm: Array,
-    displacements: Array,
-    rotations: Array,
-    translations: Array,
-    target_px: Array,
-    used: NDArray[np.bool_],
-    whitening: Array,
-    scale: PixelScale,
-    measured: int,
-) -> _State:
-    m, n = used.shape
-    cuts = cut(frame, rotations, translations)
-    predicted = scale.to_px(cuts.points_mm)
-    mask = used[..., None]
-    residual = np.where(mask, target_px - predicted, 0.0)
-    # S Q = p: where S grows by dS, Q moves by -S^-1 dS Q.
-    grown = np.zeros((m, n, 2, 3))
-    grown[..., 0, 0] = predicted[..., 0]
-    grown[..., 1, 1] = predicted[..., 1]
-    grown[..., 0, 2] = predicted[..., 1]
-    by_scale = -scale.inverse_matrix @ grown[..., :measured]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_pose = scale.inverse_matrix @ cut_jacobian(cuts, translations)
-        by_ends = scale.inverse_matrix @ _by_ends(frame, cuts, rotations) * tolerances_mm[:, None, None]
-    white = (whitening @ residual[..., None]).reshape(m, 2 * n, 1)
-    # Of the rods' ends, each spot knows only those of its own.
-    rod, of_rods = np.arange(n), np.zeros((m, n, 2, n, 6))
-    of_rods[:, rod, :, rod] = np.swapaxes(np.where(mask[..., None], whitening @ by_ends, 0.0), 0, 1)
-    of_scale = np.where(mask[..., None], whitening @ by_scale, 0.0)
-    common = np.concatenate([of_scale, of_rods.reshape(m, n, 2, 6 * n)], axis=-1).reshape(m, 2 * n, -1)
-    poses = np.where(mask[..., None], whitening @ by_pose, 0.0).reshape(m, 2 * n, 6)
-    turned, poses_turned = np.swapaxes(common, 1, 2), np.swapaxes(poses, 1, 2)
-    known = np.concatenate([np.zeros(measured), np.ones(6 * n)])
-    off = np.concatenate([np.zeros(measured), displacements.ravel()])
-    chi_square = float((white**2).sum() + (off**2).sum())
-    return _State(
-        residual,
-        chi_square if np.isfinite(chi_square) else float("inf"),
-        (turned @ common).sum(axis=0) + np.diag(known),
-        poses_turned @ common,
-        poses_turned @ poses,
-        (turned @ white)[..., 0].sum(axis=0) - off,
-        (poses_turned @ white)[..., 0],
-    )
+class _LooseRods(NamedTuple):
+    """What is fitted: a frame whose rods' ends are known to tolerances (n,) mm, to the spots of these rods."""
+
+    frame: Frame
+    tolerances_mm: Array
+    identified: IdentifiedSpots
+    whitening: Array
+    measured: int
+
+    def displaced(self, displacements: Array) -> Frame:
+        """The frame with its rods' ends displaced by (n, 6), start then end, in units of their tolerances."""
+        off_mm = self.tolerances_mm[:, None] * displacements
+        return replace(self.frame, starts=self.frame.starts + off_mm[:, :3], ends=self.frame.ends + off_mm[:, 3:])
+
+    def evaluated(self, at: ScaleAndPoses, displacements: Array) -> _State:
+        """The normal equations at a scale, poses and displacements."""
+        frame, measured = self.displaced(displacements), self.measured
+        (m, n), mask = self.identified.used.shape, self.identified.used[..., None, None]
+        now = linearised(frame, at, self.identified, self.whitening)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_ends = at.scale.inverse_matrix @ _by_ends(frame, now.cuts, at.rotations)
+            by_ends = by_ends * self.tolerances_mm[:, None, None]
+        # Of the rods' ends, each spot knows only those of its own.
+        rod, of_rods = np.arange(n), np.zeros((m, n, 2, n, 6))
+        of_rods[:, rod, :, rod] = np.swapaxes(np.where(mask, self.whitening @ by_ends, 0.0), 0, 1)
+        of_scale = now.by_scale[..., :measured]
+        common = np.concatenate([of_scale, of_rods.reshape(m, n, 2, 6 * n)], axis=-1).reshape(m, 2 * n, -1)
+        turned, poses_turned = np.swapaxes(common, 1, 2), np.swapaxes(now.by_pose, 1, 2)
+        known = np.concatenate([np.zeros(measured), np.ones(6 * n)])
+        off = np.concatenate([np.zeros(measured), displacements.ravel()])
+        chi_square = float((now.white**2).sum() + (off**2).sum())
+        return _State(
+            now.residuals_px,
+            chi_square if np.isfinite(chi_square) else float("inf"),
+            (turned @ common).sum(axis=0) + np.diag(known),
+            poses_turned @ common,
+            poses_turned @ now.by_pose,
+            (turned @ now.white)[..., 0].sum(axis=0) - off,
+            (poses_turned @ now.white)[..., 0],
+        )

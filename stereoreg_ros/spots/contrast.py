@@ -99,23 +99,25 @@ def _candidates(
         part = np.s_[start : start + at_once]
         height, noise, cut[part] = prominences(smooth, peaks.take(part), reach, most)
         rows = np.flatnonzero(height)
-        found += _regions(
-            wide, smooth.margin, peaks.take(part).take(rows), reach, height[rows], noise[rows], fewest, most
-        )
+        prominent = _Prominent(peaks.take(part).take(rows), height[rows], noise[rows])
+        found += _regions(wide, smooth.margin, prominent, reach, (fewest, most))
     return found, cut
 
 
+class _Prominent(NamedTuple):
+    """Peaks that stand out, n of them: height (n,) HU and the noise (n,) HU around them."""
+
+    peaks: Peaks
+    height: NDArray[np.float32]
+    noise: Array
+
+
 def _regions(
-    wide: NDArray[np.float32],
-    margin: int,
-    peaks: Peaks,
-    reach: int,
-    height: NDArray[np.float32],
-    noise: Array,
-    fewest: float,
-    most: float,
+    wide: NDArray[np.float32], margin: int, prominent: _Prominent, reach: int, pixels_allowed: tuple[float, float]
 ) -> list[_Candidate]:
-    """Those of the regions above half of the peaks' heights (n,), in a slice with a margin, that look like a rod's."""
+    """Those of the regions above half of the peaks' heights, in a slice with a margin, that look like a rod's."""
+    peaks, height, noise = prominent
+    fewest, most = pixels_allowed
     hu = squares_around(wide, margin, peaks, reach)
     floor = peaks.top - 0.5 * height
     own = around_middle(hu > floor[:, None, None])

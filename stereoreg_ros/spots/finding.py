@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import AUTO, RegistrationOptions
 from stereoreg_ros.spots.choice import worth_matching
 from stereoreg_ros.spots.contrast import Standing, regions_by_contrast
@@ -30,17 +30,16 @@ _SIDES: Final = (13, 19, 27, 39, 55, 101)
 _MARGIN: Final = 4
 # A centre that is not known to a pixel is none: what it belongs to looks little like a rod.
 _LARGEST_STD_PX: Final = 0.8
+_ROUNDING_PX2: Final = 1e-9
 # So many times it is chosen anew where things without a centre were among the chosen.
 _CHOICES: Final = 4
 
 
-@dataclass(frozen=True, eq=False)
-class FoundSpots:
-    """Spots of a slice, n of them, from top to bottom.
+class _Measured(NamedTuple):
+    """Spots of a picture, n of them: the fields of `SliceSpots` that are measured in it, with its names and shapes.
 
-    centres_px: (n, 2), pixel (u, v); covariances_px2: (n, 2, 2) of the centres, by the image's noise; extents_px2:
-    (n, 2, 2), second moments of what is above a third of the spot's height: its size and its elongation. cut_short:
-    (n,), whether the region ends above 0.6 of that height, so that the spot may be larger than was seen.
+    extents_px2: second moments of what is above a third of the spot's height; cut_short: whether the region ends above
+    0.6 of that height.
     """
 
     centres_px: Array
@@ -48,32 +47,38 @@ class FoundSpots:
     extents_px2: Array
     cut_short: NDArray[np.bool_]
 
-    def __len__(self) -> int:
-        return len(self.centres_px)
-
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> FoundSpots:
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> _Measured:
         """Only the given spots."""
-        return FoundSpots(*(getattr(self, entry.name)[rows] for entry in fields(self)))
+        return _Measured(
+            self.centres_px[rows], self.covariances_px2[rows], self.extents_px2[rows], self.cut_short[rows]
+        )
 
 
-def find_spots(ct_slice: Slice, options: RegistrationOptions) -> FoundSpots:
-    """The bright spots of a slice that may be rods: of an area within [min_spot_area_mm2, max_spot_area_mm2], and whole
-    in the image.
+def find_spots(ct_slice: Slice, options: RegistrationOptions) -> SliceSpots:
+    """The bright spots of a slice that may be rods, from top to bottom: of an area within
+    [min_spot_area_mm2, max_spot_area_mm2], and whole in the image.
 
     A spot is a region above the threshold (Maurin 2009, section 6.3), or with the threshold `auto` what stands out from
     its surroundings. Its centre is the centre of its symmetry.
     """
-    pixel_mm2 = ct_slice.scale.sx * ct_slice.scale.sy
+    scale = ct_slice.scale
+    pixel_mm2 = scale.sx * scale.sy
     fewest, most = options.min_spot_area_mm2 / pixel_mm2, options.max_spot_area_mm2 / pixel_mm2
     if options.threshold == AUTO:
         found = _standing_out(ct_slice.hu, regions_by_contrast(ct_slice.hu, fewest, most), options.min_inliers)
     else:
         regions = regions_above(ct_slice.hu, float(options.threshold), fewest, most)
         found, _ = _centred(ct_slice.hu, regions)
-    return found.take(np.lexsort((found.centres_px[:, 0], found.centres_px[:, 1])))
+    found = found.take(np.lexsort((found.centres_px[:, 0], found.centres_px[:, 1])))
+    return SliceSpots(
+        **found._asdict(),
+        scale=scale,
+        scanner_from_slice=ct_slice.scanner_from_slice,
+        area_mm2=ct_slice.hu.size * scale.sx * scale.sy,
+    )
 
 
-def _standing_out(hu: NDArray[np.float32], standing: Standing, least_rods: int) -> FoundSpots:
+def _standing_out(hu: NDArray[np.float32], standing: Standing, least_rods: int) -> _Measured:
     """The spots of those regions that are worth matching."""
     left = np.arange(len(standing.height))
     for _ in range(_CHOICES):
@@ -86,7 +91,7 @@ def _standing_out(hu: NDArray[np.float32], standing: Standing, least_rods: int) 
     return found
 
 
-def _centred(hu: NDArray[np.float32], regions: Regions) -> tuple[FoundSpots, NDArray[np.bool_]]:
+def _centred(hu: NDArray[np.float32], regions: Regions) -> tuple[_Measured, NDArray[np.bool_]]:
     """The spots of regions, those that have a centre, and which of the regions (n,) do."""
     width, height = regions.extent.T
     wanted = np.maximum(width, height) + 2 * _MARGIN
@@ -94,14 +99,16 @@ def _centred(hu: NDArray[np.float32], regions: Regions) -> tuple[FoundSpots, NDA
     groups = [np.flatnonzero(np.searchsorted(_SIDES, wanted) == group) for group in range(len(_SIDES))]
     parts = [_measured(hu, regions.take(rows), side) for rows, side in zip(groups, _SIDES, strict=True) if len(rows)]
     if not parts:
-        return FoundSpots(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), which[:0]), which
-    found = FoundSpots(*(np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(FoundSpots)))
+        return _Measured(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), which[:0]), which
+    found = _Measured(*(np.concatenate(of_parts) for of_parts in zip(*parts, strict=True)))
     known = np.linalg.eigvalsh(found.covariances_px2)[:, -1] <= _LARGEST_STD_PX**2
+    # Of a centre of which rounding has made a variance negative, nothing is known in one direction.
+    known &= np.linalg.eigvalsh(found.covariances_px2)[:, 0] > -_ROUNDING_PX2
     which[np.concatenate(groups)[known]] = True
     return found.take(known), which
 
 
-def _measured(hu: NDArray[np.float32], regions: Regions, side: int) -> FoundSpots:
+def _measured(hu: NDArray[np.float32], regions: Regions, side: int) -> _Measured:
     """Spots of the given regions, each looked at in a patch of side x side pixels around it."""
     rows, columns = hu.shape
     corner = regions.first + regions.extent // 2 - side // 2  # (n, 2), u and v of the patch's first pixel
@@ -124,7 +131,7 @@ def _measured(hu: NDArray[np.float32], regions: Regions, side: int) -> FoundSpot
     clipped &= clipped.sum(axis=(1, 2), keepdims=True) >= 3
     found, covariance = centres_of_symmetry(value, centre, extent, shut & ~own, clipped, noise)
     lowest = np.where(own, value, np.inf).min(axis=(1, 2))
-    return FoundSpots(corner + found, covariance, extent, lowest > _CUT_SHORT * height)
+    return _Measured(corner + found, covariance, extent, lowest > _CUT_SHORT * height)
 
 
 def _dilated(masks: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:

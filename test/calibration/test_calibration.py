@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal, Sighting, calibrate
-from stereoreg_ros.calibration.calibrate import calibrate as calibration_module
+from stereoreg_ros.calibration import judgement
+from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal, calibrate
 from stereoreg_ros.calibration.series import scale_of_series
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 from stereoreg_ros.simulation import (
     PlacedFrame,
@@ -38,18 +39,18 @@ EXACT_FRAME = replace(OPTIONS, frame_tolerance_mm=0.0)
 NOT_TOLD_APART = "Scale and size of the frame cannot be told apart from slices"
 
 
-def seen(spots_px: np.ndarray, stated: PixelScale | None = None) -> Sighting:
-    return Sighting(spots_px, np.zeros((len(spots_px), 2, 2)), stated=stated)
+def seen(spots_px: np.ndarray, stated: PixelScale | None = None) -> SliceSpots:
+    return SliceSpots(spots_px, TRUE, stated_scale=stated)
 
 
-def sightings(
+def slices_of(
     rng: np.random.Generator,
     frame: Frame,
     count: int,
     false_spots: int = 0,
     noise_px: float = NOISE_PX,
     stated: PixelScale | None = None,
-) -> list[Sighting]:
+) -> list[SliceSpots]:
     settings = SpotSetSettings(SCANNER, len(frame), false_spots, noise_px, gaussian=True)
     return [seen(random_spot_set(rng, frame, settings).spots_px, stated) for _ in range(count)]
 
@@ -77,7 +78,7 @@ class TestAccepted:
         nees = []
         trials = {1: 60, 3: 24, 10: 8}[slices]
         for _ in range(trials):
-            found = calibrate(sightings(rng, cube, slices), cube, TRUE, EXACT_FRAME)
+            found = calibrate(slices_of(rng, cube, slices), cube, TRUE, EXACT_FRAME)
             assert isinstance(found, Calibration), found.message
             assert found.frame_errors == (0.0, 0.0)
             assert "the frame is taken to be exact" in found.message
@@ -91,13 +92,13 @@ class TestAccepted:
 
     def test_forty_three_slices_are_good_to_a_thousandth(self, cube: Frame) -> None:
         rng = np.random.default_rng(43)
-        found = calibrate(sightings(rng, cube, 43), cube, TRUE, EXACT_FRAME)
+        found = calibrate(slices_of(rng, cube, 43), cube, TRUE, EXACT_FRAME)
         assert isinstance(found, Calibration), found.message
         assert abs(found.scale.sx / TRUE.sx - 1) <= 1e-3
         assert abs(found.scale.sy / TRUE.sy - 1) <= 1e-3
 
     def test_exact_spots(self, cube: Frame) -> None:
-        found = calibrate(sightings(np.random.default_rng(2), cube, 2, noise_px=0.0), cube, TRUE, OPTIONS)
+        found = calibrate(slices_of(np.random.default_rng(2), cube, 2, noise_px=0.0), cube, TRUE, OPTIONS)
         assert isinstance(found, Calibration)
         assert found.scale.sx == pytest.approx(TRUE.sx, abs=1e-8)
         assert found.scale.sy == pytest.approx(TRUE.sy, abs=1e-8)
@@ -111,7 +112,7 @@ class TestAccepted:
         for trial in range(6):
             by_x, by_y = rng.choice([0.9, 1.1], 2) if trial % 2 else 1 + rng.uniform(-0.1, 0.1, 2)
             told = PixelScale(by_x * TRUE.sx, by_y * TRUE.sy)
-            found = calibrate(sightings(rng, cube, slices, int(rng.integers(0, 9))), cube, told, OPTIONS)
+            found = calibrate(slices_of(rng, cube, slices, int(rng.integers(0, 9))), cube, told, OPTIONS)
             if not isinstance(found, Calibration):
                 refused += 1
                 continue
@@ -127,7 +128,7 @@ class TestAccepted:
         rng = np.random.default_rng(5)
         for _ in range(6):
             told = PixelScale(1.03 * TRUE.sx, 0.95 * TRUE.sy)
-            found = calibrate(sightings(rng, cube, 5, 3), cube, told, OPTIONS)
+            found = calibrate(slices_of(rng, cube, 5, 3), cube, told, OPTIONS)
             assert isinstance(found, Calibration), found.message
             assert found.slices == 5
             assert abs(found.scale.sx / TRUE.sx - 1) < 0.01
@@ -136,7 +137,7 @@ class TestAccepted:
     def test_slices_without_the_frame_do_no_harm(self, cube: Frame) -> None:
         rng = np.random.default_rng(6)
         clutter = [seen(rng.uniform(0, 500, (12, 2))) for _ in range(3)]
-        found = calibrate([*clutter, *sightings(rng, cube, 3, 2), *clutter], cube, TRUE, OPTIONS)
+        found = calibrate([*clutter, *slices_of(rng, cube, 3, 2), *clutter], cube, TRUE, OPTIONS)
         assert isinstance(found, Calibration), found.message
         assert found.slices == 3
 
@@ -156,7 +157,7 @@ class TestAccepted:
 
     def test_the_message_has_the_figures(self, cube: Frame) -> None:
         told = PixelScale(0.505, 0.485)
-        found = calibrate(sightings(np.random.default_rng(8), cube, 3), cube, told, OPTIONS)
+        found = calibrate(slices_of(np.random.default_rng(8), cube, 3), cube, told, OPTIONS)
         assert isinstance(found, Calibration)
         assert found.message.startswith("pixel spacing changed from (0.5050, 0.4850) to (0.")
         assert f"{found.scale.sx:.4f} +- {found.standard_errors[0]:.4f}" in found.message
@@ -178,7 +179,7 @@ class TestFrameAsBuilt:
         nees = []
         trials = 40 if slices == 1 else 8
         for _ in range(trials):
-            found = calibrate(sightings(rng, as_built(rng, cube, 0.2), slices), cube, TRUE, OPTIONS)
+            found = calibrate(slices_of(rng, as_built(rng, cube, 0.2), slices), cube, TRUE, OPTIONS)
             assert isinstance(found, Calibration), found.message
             error = np.array([found.scale.sx - TRUE.sx, found.scale.sy - TRUE.sy])
             nees.append(error @ np.linalg.solve(found.covariance, error))
@@ -189,7 +190,7 @@ class TestFrameAsBuilt:
         assert 2 - 4 * math.sqrt(4 / trials) < np.mean(nees) < 2 + 3 * math.sqrt(4 / trials)
 
     def test_what_a_file_says_of_its_rods_counts_before_the_option(self, cube: Frame) -> None:
-        taken = sightings(np.random.default_rng(20), cube, 3)
+        taken = slices_of(np.random.default_rng(20), cube, 3)
         errors = {}
         for name, frame in (
             ("exact", replace(cube, tolerances_mm=np.zeros(6))),
@@ -208,7 +209,7 @@ class TestFrameAsBuilt:
         rng = np.random.default_rng(21)
         options, near = replace(OPTIONS, frame_tolerance_mm=0.1), CalibrationOptions(calibration_max_change=0.02)
         for _ in range(6):
-            assert not calibrate(sightings(rng, as_built(rng, cube, 1.5), 3), cube, TRUE, options, near)
+            assert not calibrate(slices_of(rng, as_built(rng, cube, 1.5), 3), cube, TRUE, options, near)
 
 
 class TestWhereTheSpacingCameFrom:
@@ -219,7 +220,7 @@ class TestWhereTheSpacingCameFrom:
     def test_of_the_slices_it_is_not_made_to_fit_the_frame(self, cube: Frame) -> None:
         rng = np.random.default_rng(30)
         for slices in (1, 4, 10):
-            taken = sightings(rng, grown(cube, self.LARGE), slices, 3, stated=TRUE)
+            taken = slices_of(rng, grown(cube, self.LARGE), slices, 3, stated=TRUE)
             refusal = calibrate(taken, cube, TRUE, OPTIONS)
             assert isinstance(refusal, CalibrationRefusal), refusal.message
             assert "scanner, or frame file?" in refusal.message
@@ -232,12 +233,12 @@ class TestWhereTheSpacingCameFrom:
             assert 2.0 < float(size[1]) < 4.0
 
     def test_a_smaller_frame_is_called_smaller(self, cube: Frame) -> None:
-        taken = sightings(np.random.default_rng(31), grown(cube, 0.98), 10, stated=TRUE)
+        taken = slices_of(np.random.default_rng(31), grown(cube, 0.98), 10, stated=TRUE)
         assert re.search(r"would have to be [12]\.\d % smaller", calibrate(taken, cube, TRUE, OPTIONS).message)
 
     @pytest.mark.parametrize("limit", [0.15, 0.05])
     def test_a_limit_set_on_purpose_counts(self, cube: Frame, limit: float) -> None:
-        taken = sightings(np.random.default_rng(32), grown(cube, self.LARGE), 5, stated=TRUE)
+        taken = slices_of(np.random.default_rng(32), grown(cube, self.LARGE), 5, stated=TRUE)
         calibration = CalibrationOptions(calibration_max_change=limit)
         found = calibrate(taken, cube, TRUE, OPTIONS, calibration)
         assert isinstance(found, Calibration), found.message
@@ -245,7 +246,7 @@ class TestWhereTheSpacingCameFrom:
         assert re.search(r"the frame would have to be [23]\.\d % larger than its file says", found.message)
 
     def test_typed_in_it_may_be_off_as_well(self, cube: Frame) -> None:
-        taken = sightings(np.random.default_rng(33), grown(cube, self.LARGE), 5)
+        taken = slices_of(np.random.default_rng(33), grown(cube, self.LARGE), 5)
         found = calibrate(taken, cube, TRUE, OPTIONS)
         assert isinstance(found, Calibration), found.message
         assert NOT_TOLD_APART in found.message
@@ -253,7 +254,7 @@ class TestWhereTheSpacingCameFrom:
 
     def test_a_small_change_is_made(self, cube: Frame) -> None:
         told = PixelScale(0.9985 * TRUE.sx, 1.0015 * TRUE.sy)
-        taken = sightings(np.random.default_rng(34), cube, 30, stated=told)
+        taken = slices_of(np.random.default_rng(34), cube, 30, stated=told)
         found = calibrate(taken, cube, told, EXACT_FRAME)
         assert isinstance(found, Calibration), found.message
         assert abs(found.scale.sx - TRUE.sx) < 4 * found.standard_errors[0] < 0.003 * TRUE.sx
@@ -261,15 +262,15 @@ class TestWhereTheSpacingCameFrom:
     def test_the_change_is_that_from_what_the_slices_say_not_from_what_is_in_use(self, cube: Frame) -> None:
         """Many small steps must not add up."""
         in_use = PixelScale(1.008 * TRUE.sx, 1.008 * TRUE.sy)
-        taken = sightings(np.random.default_rng(35), cube, 12, stated=TRUE)
+        taken = slices_of(np.random.default_rng(35), cube, 12, stated=TRUE)
         assert calibrate(taken, cube, in_use, EXACT_FRAME)
         off = replace(TRUE, sx=0.992 * TRUE.sx, sy=0.992 * TRUE.sy)
-        taken = sightings(np.random.default_rng(35), cube, 12, stated=off)
+        taken = slices_of(np.random.default_rng(35), cube, 12, stated=off)
         assert "scanner, or frame file?" in calibrate(taken, cube, TRUE, EXACT_FRAME).message
 
     def test_axes_that_differ_are_not_put_down_to_the_frames_size(self, cube: Frame) -> None:
         told = PixelScale(1.03 * TRUE.sx, TRUE.sy)
-        taken = sightings(np.random.default_rng(36), cube, 10, stated=told)
+        taken = slices_of(np.random.default_rng(36), cube, 10, stated=told)
         message = calibrate(taken, cube, told, OPTIONS).message
         assert "scanner, or frame file?" in message
         assert re.search(r"[23]\.\d % larger along the rows and 0\.\d % (larger|smaller) along the columns", message)
@@ -326,12 +327,12 @@ class TestRefused:
         """Off by 8 %, and no more than 4 % allowed: what is found in reach of the search is refused all the same."""
         told = PixelScale(1.08 * TRUE.sx, TRUE.sy)
         strict = CalibrationOptions(calibration_max_change=0.04)
-        taken = sightings(np.random.default_rng(11), cube, 3)
+        taken = slices_of(np.random.default_rng(11), cube, 3)
         message = self.refusal(taken, cube, told, OPTIONS, strict).message
         assert "4 %" in message
 
     def test_a_scale_that_is_hardly_known(self, cube: Frame) -> None:
-        taken = sightings(np.random.default_rng(12), cube, 1)
+        taken = slices_of(np.random.default_rng(12), cube, 1)
         options = RegistrationOptions(spot_noise_px=1.5, max_log10_false_alarms=0.0)
         message = self.refusal(taken, cube, TRUE, options).message
         assert "has a standard error of" in message
@@ -339,7 +340,7 @@ class TestRefused:
 
     def test_a_fit_that_would_get_worse(self, cube: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
         """As if the steps had ended at another place than the best."""
-        taken = sightings(np.random.default_rng(15), cube, 3)
+        taken = slices_of(np.random.default_rng(15), cube, 3)
 
         def ended_elsewhere(*arguments: Any, **named: Any) -> TolerantScale:
             found = calibrate_tolerantly(*arguments, **named)
@@ -347,7 +348,7 @@ class TestRefused:
 
         best = calibrate(taken, cube, TRUE, OPTIONS)
         assert isinstance(best, Calibration)
-        monkeypatch.setattr(calibration_module, "calibrate_tolerantly", ended_elsewhere)
+        monkeypatch.setattr(judgement, "calibrate_tolerantly", ended_elsewhere)
         message = self.refusal(taken, cube, best.scale, OPTIONS).message
         assert "the slices fit (" in message
         assert "better than (" in message
@@ -378,7 +379,7 @@ class TestRefused:
 
     def test_the_search_can_be_given_up(self, cube: Frame) -> None:
         rng = np.random.default_rng(14)
-        taken = [*sightings(rng, cube, 1), *(seen(rng.uniform(0, 500, (9, 2))) for _ in range(2))]
+        taken = [*slices_of(rng, cube, 1), *(seen(rng.uniform(0, 500, (9, 2))) for _ in range(2))]
         told: list[float] = []
 
         def ten_times(share: float) -> bool:

@@ -12,20 +12,20 @@ from scipy.optimize import least_squares
 from stereoreg_ros.calibration.calibrate import (
     Calibration,
     CalibrationRefusal,
-    Sighting,
     calibrate,
-    match_sighting,
-    sighting_of,
 )
+from stereoreg_ros.calibration.matching import match_slice
 from stereoreg_ros.calibration.series import scale_of_series
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
-from stereoreg_ros.registration import register_spots
+from stereoreg_ros.registration import register_slice, register_spots
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, random_pose, render_slice
+from stereoreg_ros.spots import find_spots
 
 TRUE = PixelScale(0.5, 0.6)
 SCANNER = ScannerSettings(shape=(200, 300), scale=TRUE, body=False, noise_hu=5.0)
@@ -57,8 +57,10 @@ def off_by(
     return [project(frame, pose, scale)[0] + rng.normal(0.0, noise_px, (len(frame), 2)) for pose in poses]
 
 
-def seen(spots_px: Array, plane: Pose | None = None, stated: PixelScale | None = None) -> Sighting:
-    return Sighting(spots_px, np.zeros((len(spots_px), 2, 2)), 200 * 300, plane, stated)
+def seen(spots_px: Array, plane: Pose | None = None, stated: PixelScale | None = None) -> SliceSpots:
+    area_mm2 = 200 * 300 * TRUE.sx * TRUE.sy
+    plane = plane or Pose.identity()
+    return SliceSpots(spots_px, TRUE, scanner_from_slice=plane, area_mm2=area_mm2, stated_scale=stated)
 
 
 class TestPlane:
@@ -73,8 +75,8 @@ class TestPlane:
 
     def test_of_a_slice_of_unknown_plane_it_does_not_stand_like_that(self, cube: Frame) -> None:
         spots = project(cube, tilted_poses(cube, 1)[0], TRUE)[0]
-        assert match_sighting(seen(spots, GANTRY), cube, TRUE, UPRIGHT)
-        assert not match_sighting(seen(spots), cube, TRUE, UPRIGHT)
+        assert match_slice(seen(spots, GANTRY), cube, TRUE, UPRIGHT)
+        assert not match_slice(seen(spots), cube, TRUE, UPRIGHT)
 
     def test_a_series_has_that_of_its_files(self, cube: Frame) -> None:
         rng = np.random.default_rng(4)
@@ -87,22 +89,22 @@ class TestPlane:
         assert (series.outcome.slices, len(series.slices)) == (3, 3)
 
 
-class TestSighting:
+class TestSpotsOfResults:
     def test_has_all_that_is_known_of_the_slice(self, cube: Frame) -> None:
         spots = project(cube, tilted_poses(cube, 1)[0], TRUE)[0]
         covariances = np.arange(1.0, 7.0)[:, None, None] * np.diag([0.01, 0.04])
         for options in (OPTIONS, UPRIGHT):  # accepted, and refused
-            result = register_spots(spots, cube, TRUE, options, covariances_px2=covariances)
-            kept = sighting_of(result, 200 * 300, GANTRY, TRUE)
-            np.testing.assert_array_equal(kept.spots_px, spots)
+            result = register_spots(spots, cube, TRUE, options, GANTRY, 18_000.0, covariances_px2=covariances)
+            kept = result.spots
+            np.testing.assert_array_equal(kept.centres_px, spots)
             np.testing.assert_array_equal(kept.covariances_px2, covariances)
-            assert (kept.pixels, kept.scanner_from_slice, kept.stated) == (60_000, GANTRY, TRUE)
+            assert (kept.area_mm2, kept.scanner_from_slice, kept.scale) == (18_000.0, GANTRY, TRUE)
 
     def test_area_is_that_of_as_many_pixels(self, cube: Frame) -> None:
         spots = project(cube, tilted_poses(cube, 1)[0], TRUE)[0]
-        assert seen(spots).area_mm2(TRUE) == pytest.approx(200 * 300 * 0.5 * 0.6)
-        assert Sighting(spots, np.zeros((6, 2, 2))).area_mm2(TRUE) is None
-        matched = match_sighting(seen(spots), cube, TRUE, OPTIONS)
+        assert seen(spots).with_scale(PixelScale(0.7, 0.2)).area_mm2 == pytest.approx(200 * 300 * 0.7 * 0.2)
+        assert SliceSpots(spots, TRUE).with_scale(PixelScale(0.7, 0.2)).area_mm2 is None
+        matched = match_slice(seen(spots), cube, TRUE, OPTIONS)
         by_area = [register_spots(spots, cube, TRUE, OPTIONS, slice_area_mm2=area) for area in (18_000.0, None)]
         assert matched
         assert by_area[0]
@@ -110,6 +112,22 @@ class TestSighting:
         chances = [one.estimate.log10_false_alarms for one in (matched, *by_area)]  # type: ignore[union-attr]
         assert chances[0] == chances[1]
         assert chances[0] < chances[2] - 1.0
+
+
+def test_the_lengths_of_spots_count_as_in_a_registration(cube: Frame) -> None:
+    """Of a slice said to be 20 mm thick, every rod would have to leave a long streak."""
+    rng = np.random.default_rng(12)
+    ct_slice = render_slice([PlacedFrame(cube, random_pose(rng, cube, SCANNER))], SCANNER, rng)
+    spots = find_spots(ct_slice, OPTIONS)
+    assert match_slice(spots, cube, TRUE, OPTIONS)
+    thick = replace(OPTIONS, slice_thickness_mm=20.0)
+    refused = match_slice(spots, cube, TRUE, thick)
+    assert not refused
+    assert refused.reason == "no_consensus"
+    assert not match_slice(register_slice(ct_slice, cube, OPTIONS).spots, cube, TRUE, thick)
+    # An outside spot finder has its say, too.
+    unmeasured = SliceSpots(spots.centres_px, TRUE, spots.covariances_px2)
+    assert match_slice(unmeasured, cube, TRUE, thick)
 
 
 class TestStandardErrors:
@@ -138,7 +156,7 @@ class TestStandardErrors:
         stds = np.full(2, 0.1)
         stds[axis] = 1.5
         spots = project(cube, tilted_poses(cube, 1)[0], TRUE)[0]
-        taken = Sighting(spots, np.tile(np.diag(stds**2), (6, 1, 1)), 60_000)
+        taken = SliceSpots(spots, TRUE, np.tile(np.diag(stds**2), (6, 1, 1)), area_mm2=18_000.0)
         found = calibrate([taken], cube, TRUE, replace(EXACT_FRAME, max_log10_false_alarms=-1.0))
         assert isinstance(found, CalibrationRefusal)
         assert f"{name} = 0." in found.message
@@ -179,7 +197,7 @@ class TestStrictness:
         while high - low > 0.1:
             middle = 0.5 * (low + high)
             limited = replace(OPTIONS, max_log10_false_alarms=middle)
-            low, high = (low, middle) if match_sighting(seen(spots), cube, right.scale, limited) else (middle, high)
+            low, high = (low, middle) if match_slice(seen(spots), cube, right.scale, limited) else (middle, high)
         told = PixelScale(1.1 * TRUE.sx, 0.9 * TRUE.sy)
         for limit, accepted in ((high + math.log10(49) - 0.4, False), (high + math.log10(49) + 0.4, True)):
             found = calibrate([seen(spots)], cube, told, replace(OPTIONS, max_log10_false_alarms=limit))

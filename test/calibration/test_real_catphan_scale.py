@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereoreg_ros import load_frame, register_slice
-from stereoreg_ros.calibration.calibrate import Calibration, calibrate, sighting_of
+from stereoreg_ros import load_frame
+from stereoreg_ros.calibration.calibrate import Calibration, calibrate
+from stereoreg_ros.spots import find_spots
 from support.real_images import CATPHAN_OPTIONS, catphan, height, shows_module
 
 
@@ -18,11 +19,11 @@ def test_scale_of_several_slices(factors):
     inner = sorted(filter(shows_module, catphan()), key=height)[1:-1]  # in the outer two the wires end
     true = inner[0].ct_slice.scale
     told = replace(true, sx=factors[0] * true.sx, sy=factors[1] * true.sy)
-    sightings = []
+    slices = []
     for one in inner:
         ct_slice = replace(one.ct_slice, scale=told)
-        sightings.append(sighting_of(register_slice(ct_slice, frame, CATPHAN_OPTIONS), ct_slice.hu.size))
-    found = calibrate(sightings, frame, told, CATPHAN_OPTIONS)
+        slices.append(find_spots(ct_slice, CATPHAN_OPTIONS))
+    found = calibrate(slices, frame, told, CATPHAN_OPTIONS)
     assert isinstance(found, Calibration), found.message
     print(found.message)
     assert found.slices >= 5

@@ -22,6 +22,7 @@ from pydicom.uid import CTImageStorage, DigitalXRayImageStorageForPresentation
 from stereoreg_ros import cli, load_frame
 from stereoreg_ros.geometry.pose import Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Refusal
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
@@ -264,7 +265,7 @@ def test_every_option_has_its_flag(stereoreg, cube_slice, monkeypatch):
 
     def register_slice(ct_slice, frame, options):
         given.append(options)
-        return Refusal(frame, ct_slice.scale, np.empty((0, 2)), "no_consensus", "not tried")
+        return Refusal(frame, SliceSpots(np.empty((0, 2)), ct_slice.scale), "no_consensus", "not tried")
 
     monkeypatch.setattr("stereoreg_ros.cli.register.register_slice", register_slice)
     wanted = RegistrationOptions(

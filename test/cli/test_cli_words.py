@@ -20,6 +20,7 @@ from stereoreg_ros.frames.expected_error import Imaging
 from stereoreg_ros.frames.proposal import Proposal
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import CalibrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Reason, Refusal, Registration
 from stereoreg_ros.worst_case import WorstCase
@@ -42,11 +43,11 @@ def estimate(pose: Pose = TURNED, rods: int = 5, residual_mm: float = 0.25) -> P
 
 
 def accepted(caution: str = "") -> Registration:
-    return Registration(FRAME, SCALE, RegistrationOptions(), np.zeros((9, 2)), estimate(), caution)
+    return Registration(FRAME, SliceSpots(np.zeros((9, 2)), SCALE), RegistrationOptions(), estimate(), caution)
 
 
 def refused(reason: Reason, *estimates: PoseEstimate) -> Refusal:
-    return Refusal(FRAME, SCALE, np.zeros((9, 2)), reason, f"because it is {reason}", estimates)
+    return Refusal(FRAME, SliceSpots(np.zeros((9, 2)), SCALE), reason, f"because it is {reason}", estimates)
 
 
 class Command:

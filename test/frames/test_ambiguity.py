@@ -15,6 +15,7 @@ from stereoreg_ros.frames.ambiguity import Trial, reasons, trials
 from stereoreg_ros.frames.meeting import MIDDLE_MM, Meetings
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.result import Match, PoseEstimate, Reason
 
 FRAME = load_frame("cube6")
@@ -44,8 +45,8 @@ class Registering:
         self.area_mm2 = slice_area_mm2
         estimates = tuple(self._estimate(put) for put in self._put)
         if self._refused is not None:
-            return Refusal(FRAME, SCALE, spots_px, self._refused, "refused", estimates)
-        return Registration(FRAME, SCALE, PERFECT, spots_px, estimates[0])
+            return Refusal(FRAME, SliceSpots(spots_px, SCALE), self._refused, "refused", estimates)
+        return Registration(FRAME, SliceSpots(spots_px, SCALE), PERFECT, estimates[0])
 
     def _estimate(self, put: Sequence[int]) -> PoseEstimate:
         # Matches come in the order of the rods, not of the spots.

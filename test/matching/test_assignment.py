@@ -16,7 +16,7 @@ from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.settling import _assign
 from stereoreg_ros.matching.spots import Spots, Streaks
 from stereoreg_ros.matching.tolerances import Tolerances
-from stereoreg_ros.matching.valley_starts import starts_along_valley
+from stereoreg_ros.matching.twin_starts import starts_along_valley
 from stereoreg_ros.solvers.likelihood_valley import ARM_MM
 from stereoreg_ros.solvers.maximum_likelihood import Refined
 

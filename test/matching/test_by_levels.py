@@ -10,19 +10,23 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from stereoreg_ros import RegistrationOptions, load_frame
+from stereoreg_ros import load_frame
 from stereoreg_ros.geometry.frame import Frame
-from stereoreg_ros.matching import by_levels
-from stereoreg_ros.matching.consensus import decades_apart, score
+from stereoreg_ros.matching import level_search
+from stereoreg_ros.matching.by_levels import ByLevels
+from stereoreg_ros.matching.consensus import score
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
+from stereoreg_ros.matching.level_search import LevelSearch
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.problem import Problem
 from stereoreg_ros.matching.seeds import Starts
 from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.tables import SeedTables, tolerance_mm
 from stereoreg_ros.matching.tolerances import Tolerances
-from stereoreg_ros.matching.valley_starts import starts_along_valley
+from stereoreg_ros.matching.twin_starts import starts_along_valley, starts_with_spots_exchanged, starts_without_one
+from stereoreg_ros.matching.twins import Twins
 
 ANY = Prior(np.eye(3), math.pi)
-OPTIONS = RegistrationOptions()
 # The slice is z = 0 of the frame; the fifth rod is cut 2 mm beside the first one.
 PLACES = np.array([[0.0, 0.0], [60.0, 0.0], [0.0, 60.0], [60.0, 70.0], [2.0, 0.0], [80.0, 40.0]])
 SLOPES = np.array([[0.0, 0.1], [0.1, 0.0], [0.0, -0.1], [0.4, 0.3], [-0.1, 0.05], [0.05, 0.2]])
@@ -46,22 +50,26 @@ def explanation(spot_of_line: ArrayLike = FIVE, chi_square: float = 1.0) -> Hypo
     return Hypothesis(np.eye(3), np.zeros(3), np.asarray(spot_of_line), chi_square, information, 0)
 
 
-def searching(given: Spots) -> by_levels._Search:
-    return by_levels._Search(given, frame(), ANY, OPTIONS)
+def problem(given: Spots | None = None) -> Problem:
+    return Problem(spots() if given is None else given, frame(), ANY, 4, -6.0)
+
+
+def searching(given: Spots) -> LevelSearch:
+    return LevelSearch(problem(given), SeedTables(frame()))
 
 
 class TestStarts:
     def test_a_rod_without_a_spot_may_have_that_of_the_one_it_meets(self) -> None:
-        starts = by_levels._starts_with_spots_exchanged(explanation(), spots(), frame())
+        starts = starts_with_spots_exchanged(explanation(), spots(), frame())
         assert starts.spot_of_line.tolist() == [[UNMATCHED, 1, 2, 3, 0, 5]]
         np.testing.assert_array_equal(starts.rotations, np.eye(3)[None])
 
     def test_but_not_where_it_ends_before_the_slice(self) -> None:
-        starts = by_levels._starts_with_spots_exchanged(explanation(), spots(), frame(fifth_ends_at_mm=-5.0))
+        starts = starts_with_spots_exchanged(explanation(), spots(), frame(fifth_ends_at_mm=-5.0))
         assert len(starts.spot_of_line) == 0
 
     def test_each_rod_is_left_out_in_turn(self) -> None:
-        starts = by_levels._starts_without_one(explanation())
+        starts = starts_without_one(explanation())
         expected = np.tile(FIVE, (5, 1))
         for row, line in enumerate([0, 1, 2, 3, 5]):
             expected[row, line] = UNMATCHED
@@ -77,13 +85,12 @@ class TestStarts:
 
             return settle
 
-        monkeypatch.setattr(by_levels, "settle", recorded("anew"))
-        monkeypatch.setattr(by_levels, "settle_as_matched", recorded("as matched"))
-        monkeypatch.setattr(by_levels, "_FEWEST_WITHOUT_TWINS", 4)
+        monkeypatch.setattr(level_search, "settle", recorded("anew"))
+        monkeypatch.setattr(level_search, "settle_as_matched", recorded("as matched"))
         weak = replace(explanation(), information=np.diag([100.0, 100.0, 1.0, 1e5, 1e5, 1e5]))
-        assert list(searching(spots()).twins_of([weak], looks_twice=False)) == []
+        assert list(searching(spots()).twins_of([weak], looks_again=False)) == []
         assert settled["as matched"].spot_of_line.tolist() == [[UNMATCHED, 1, 2, 3, 0, 5]]
-        parts = [starts_along_valley(weak), by_levels._starts_without_one(weak)]
+        parts = [starts_along_valley(weak), starts_without_one(weak)]
         assert len(parts[0].rotations) > 5
         for name in ("rotations", "translations", "spot_of_line"):
             expected = np.concatenate([getattr(part, name) for part in parts])
@@ -118,16 +125,16 @@ class TestTwinsOfFrames:
         ("name", "rods", "has_twins"), [("cube8", 8, False), ("cube6", 6, True), ("zframe", 7, True)]
     )
     def test_of_shipped_ones(self, name: str, rods: int, has_twins: bool) -> None:
-        assert by_levels._has_twins(load_frame(name), rods, 0.25) is has_twins
+        assert Twins(SeedTables(load_frame(name))).exist(rods, 0.25) is has_twins
 
     def test_twins_are_assumed_where_no_slice_shows_that_many_rods(self) -> None:
-        assert by_levels._has_twins(load_frame("cube6"), 7, 0.25)
+        assert Twins(SeedTables(load_frame("cube6"))).exist(7, 0.25)
 
 
 def test_distances_are_known_to_a_tenth_of_a_millimetre_or_worse() -> None:
     """Six standard deviations and a twentieth of a millimetre, rounded up."""
-    assert by_levels._tolerance_mm(0.15) == pytest.approx(1.0)
-    assert by_levels._tolerance_mm(0.16) == pytest.approx(1.1)
+    assert tolerance_mm(0.15) == pytest.approx(1.0)
+    assert tolerance_mm(0.16) == pytest.approx(1.1)
 
 
 def test_explanations_are_told_apart_from_a_number_of_decades_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,11 +160,11 @@ class TestFindBetter:
         def level(_: object, rods: int, *__: object) -> Iterator[Hypothesis]:
             return iter([one] if at_once and rods == one.inliers else [])
 
-        monkeypatch.setattr(by_levels._Search, "level", level)
-        monkeypatch.setattr(by_levels._Search, "second_look", lambda *_: iter([] if at_once else [one]))
-        monkeypatch.setattr(by_levels._Search, "false_alarms", lambda *_: log10)
-        monkeypatch.setattr(by_levels._Search, "least_false_alarms", lambda *_: -20.0)
-        return by_levels.find_better(spots(), frame(), ANY, OPTIONS, -3.0, least_score, fewest)
+        monkeypatch.setattr(LevelSearch, "level", level)
+        monkeypatch.setattr(LevelSearch, "second_look", lambda *_: iter([] if at_once else [one]))
+        monkeypatch.setattr(LevelSearch, "false_alarms", lambda *_: log10)
+        monkeypatch.setattr(LevelSearch, "least_false_alarms", lambda *_: -20.0)
+        return ByLevels(frame()).find_better(problem(), -3.0, least_score, fewest)
 
     def test_is_found_at_once_or_by_a_second_look(self, monkeypatch: pytest.MonkeyPatch) -> None:
         one = explanation()
@@ -192,24 +199,24 @@ class TestNothingFound:
             looked.append(rods)
             return iter([])
 
-        monkeypatch.setattr(by_levels._Search, "hopeless", lambda _, rods: rods < 6)
-        monkeypatch.setattr(by_levels._Search, "level", lambda *_: iter([]))
-        monkeypatch.setattr(by_levels._Search, "second_look", second_look)
-        found = by_levels.match(spots(), frame(), ANY, OPTIONS)
+        monkeypatch.setattr(LevelSearch, "hopeless", lambda _, rods: rods < 6)
+        monkeypatch.setattr(LevelSearch, "level", lambda *_: iter([]))
+        monkeypatch.setattr(LevelSearch, "second_look", second_look)
+        found = ByLevels(frame()).match(problem())
         assert looked == [6]
         assert (found.hypotheses, found.least_rods, found.given_up) == ([], 6, "")
 
     def test_but_not_where_nothing_was_sought(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(by_levels._Search, "hopeless", lambda *_: True)
-        found = by_levels.match(spots(), frame(), ANY, OPTIONS)
+        monkeypatch.setattr(LevelSearch, "hopeless", lambda *_: True)
+        found = ByLevels(frame()).match(problem())
         assert (found.hypotheses, found.least_rods) == ([], 7)
 
 
 def test_what_is_recognised_is_known_by_how_often_chance_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
     rival = replace(explanation(), translation=np.array([30.0, 0.0, 0.0]))
-    monkeypatch.setattr(by_levels._Search, "hopeless", lambda *_: False)
-    monkeypatch.setattr(by_levels._Search, "level", lambda *_: iter([explanation(), rival]))
-    found = by_levels.match_most(spots(), frame(), ANY, OPTIONS)
+    monkeypatch.setattr(LevelSearch, "hopeless", lambda *_: False)
+    monkeypatch.setattr(LevelSearch, "level", lambda *_: iter([explanation(), rival]))
+    found = ByLevels(frame()).match_most(problem())
     assert found
-    assert decades_apart(OPTIONS) == 3.0
+    assert problem().decades_apart == 3.0
     assert np.isfinite([one.log10_false_alarms for one in found[:1]]).all()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -16,10 +17,11 @@ from stereoreg_ros import PixelScale, Pose, RegistrationOptions, load_frame, reg
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import nearest_rotation, rotation_angle
 from stereoreg_ros.geometry.projection import project
-from stereoreg_ros.matching import by_levels
-from stereoreg_ros.matching.consensus import decades_apart, distinct, judged, log10_false_alarms, score
+from stereoreg_ros.matching.by_levels import ByLevels
+from stereoreg_ros.matching.consensus import distinct, judged, log10_false_alarms, score
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.problem import Problem
 from stereoreg_ros.matching.seeds import Starts
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
@@ -34,6 +36,11 @@ AREA_MM2 = 65536.0
 ANYWHERE = Prior(np.eye(3), math.pi)
 STEPS = 30
 MOST_STARTS = 6000
+
+
+@lru_cache(maxsize=4)
+def matcher_of(frame: Frame) -> ByLevels:
+    return ByLevels(frame)
 
 
 def spots_of(frame: Frame, settings: SpotSetSettings, spots_px: np.ndarray, area_mm2: float | None = None) -> Spots:
@@ -87,15 +94,14 @@ def test_nothing_that_a_search_of_all_positions_finds_is_missed(name: str, visib
     frame = load_frame(name)
     settings = SpotSetSettings(SCANNER, visible, false_spots, 0.3)
     # Chance is no matter here: few spots leave none of these explanations beyond doubt.
-    options = RegistrationOptions(spot_noise_px=settings.noise_std_px, max_log10_false_alarms=0.0)
-    prior = ANYWHERE
+    prior, matcher = ANYWHERE, ByLevels(frame)
     rng = np.random.default_rng(8)
     compared, rivals = 0, 0
     for _ in range(PROBLEMS):
         problem = random_spot_set(rng, frame, settings)
         spots = spots_of(frame, settings, problem.spots_px)
         gains = spots.gains(frame)
-        ours = by_levels.match(spots, frame, prior, options).hypotheses
+        ours = matcher.match(Problem(spots, frame, prior, 4, 0.0)).hypotheses
         # Any three rods with a spot will do: a search of all positions along these finds every explanation with them.
         predicted, _ = project(frame, problem.slice_from_frame, SCANNER.scale)
         offset = np.linalg.norm(predicted[:, None] - problem.spots_px, axis=-1).min(axis=1)
@@ -168,15 +174,15 @@ def true_explanation(
 def is_missed(frame: Frame, settings: SpotSetSettings, spots_px: np.ndarray, pose: Pose) -> bool | None:
     """Whether a true pose that could be accepted is neither listed nor ruled out; None where it could not be."""
     spots = spots_of(frame, settings, spots_px, AREA_MM2)
-    options = RegistrationOptions(spot_noise_px=settings.noise_std_px)
     truth = true_explanation(frame, spots, spots_px, pose, settings.noise_std_px)
-    if truth is None or log10_false_alarms(truth, spots, frame, ANYWHERE) > options.max_log10_false_alarms:
+    if truth is None or log10_false_alarms(truth, spots, frame, ANYWHERE) > -6.0:
         return None
-    listed = by_levels.match(spots, frame, ANYWHERE, options).hypotheses
+    problem = Problem(spots, frame, ANYWHERE, 4, -6.0)
+    listed = matcher_of(frame).match(problem).hypotheses
     gains = spots.gains(frame)
     # Of the same valley counts as the same: its covariance holds both.
     alone = distinct([*listed, truth], gains)
-    return len(alone) > len(listed) and len(judged(alone, spots, frame, ANYWHERE, decades_apart(options))) > len(listed)
+    return len(alone) > len(listed) and len(judged(alone, spots, frame, ANYWHERE, problem.decades_apart)) > len(listed)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ import pytest
 from stereoreg_ros import Pose, RegistrationOptions, load_frame, register_spots
 from stereoreg_ros.geometry.pose import rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
-from stereoreg_ros.matching import by_levels, near
+from stereoreg_ros.matching import near
+from stereoreg_ros.matching.by_levels import ByLevels
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.level_search import LevelSearch, SearchGivenUpError
 from stereoreg_ros.matching.near import match_near
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.problem import Problem
 from stereoreg_ros.matching.settling import settle
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
@@ -187,12 +191,12 @@ def test_other_matches_of_the_pose_widen_it_near_a_guess_too(monkeypatch: pytest
     spots = project(CUBE, truth, SCALE)[0] + rng.normal(0, 0.2, (6, 2))
     plain = register_spots(spots, CUBE, SCALE, PERFECT, previous=truth)
 
-    def widening(*given, **named) -> Found:
+    def widening(*given: Any, **named: Any) -> Found:
         (one,) = match(*given, **named).hypotheses
         return Found([replace(one, information=one.information / 4, is_widened=True)], 6)
 
-    match = by_levels.match
-    monkeypatch.setattr(by_levels, "match", widening)
+    match = ByLevels.match_anywhere
+    monkeypatch.setattr(ByLevels, "match_anywhere", widening)
     wide = register_spots(spots, CUBE, SCALE, PERFECT, previous=truth)
     assert plain
     assert wide
@@ -203,13 +207,13 @@ def test_what_chance_may_bring_near_a_guess_is_left_to_the_search_without() -> N
     truth = random_pose(np.random.default_rng(14), CUBE, SCANNER)
     mm = SCALE.to_mm(project(CUBE, truth, SCALE)[0])
     spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2, Tolerances.none(CUBE))
-    prior = Prior(np.eye(3), np.pi)
-    found = match_near(spots, CUBE, prior, RegistrationOptions(), truth)
+    problem = Problem(spots, CUBE, Prior(np.eye(3), np.pi), 4, -6.0, truth)
+    found = match_near(problem, ByLevels(CUBE))
     assert found is not None
     (best,) = found.hypotheses
     for allowed, is_found in ((best.log10_false_alarms + 0.1, True), (best.log10_false_alarms - 0.1, False)):
-        options = RegistrationOptions(max_log10_false_alarms=allowed)
-        assert (match_near(spots, CUBE, prior, options, truth) is not None) is is_found
+        stricter = replace(problem, max_log10_false_alarms=allowed)
+        assert (match_near(stricter, ByLevels(CUBE)) is not None) is is_found
 
 
 def test_where_the_nearest_spots_leave_a_rod_out_that_must_show_others_are_tried(
@@ -218,7 +222,7 @@ def test_where_the_nearest_spots_leave_a_rod_out_that_must_show_others_are_tried
     truth = random_pose(np.random.default_rng(14), CUBE, SCANNER)
     mm = SCALE.to_mm(project(CUBE, truth, SCALE)[0])
     spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2, Tolerances.none(CUBE))
-    prior = Prior(np.eye(3), np.pi)
+    problem = Problem(spots, CUBE, Prior(np.eye(3), np.pi), 4, -6.0, truth)
 
     def lacking(*given) -> list[Hypothesis]:
         (one,) = settle(*given)
@@ -227,19 +231,19 @@ def test_where_the_nearest_spots_leave_a_rod_out_that_must_show_others_are_tried
         return [replace(one, spot_of_line=spot_of_line, missing=1)]
 
     monkeypatch.setattr(near, "settle", lacking)
-    found = match_near(spots, CUBE, prior, RegistrationOptions(), truth)
+    found = match_near(problem, ByLevels(CUBE))
     assert found is not None
     assert [(one.inliers, one.missing) for one in found.hypotheses] == [(6, 0)]
 
 
 def test_where_twins_are_sought_in_vain_for_long_there_is_no_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     def endless(*_: object, **__: object) -> None:
-        raise by_levels.SearchGivenUpError
+        raise SearchGivenUpError
 
     truth = random_pose(np.random.default_rng(13), CUBE, SCANNER)
     spots, _ = project(CUBE, truth, SCALE)
     assert register_spots(spots, CUBE, SCALE, previous=truth)
-    monkeypatch.setattr(by_levels._Search, "twins_of", endless)
+    monkeypatch.setattr(LevelSearch, "twins_of", endless)
     result = register_spots(spots, CUBE, SCALE, previous=truth)
     assert not result
     assert "given up" in result.message
@@ -279,9 +283,10 @@ def test_twins_of_what_is_known_are_sought_even_where_chance_is_not_ruled_out() 
     mm = SCALE.to_mm(spots_px)
     spots = Spots.of(mm, np.tile(0.15**2 * np.eye(2), (len(mm), 1, 1)), 256.0**2, Tolerances.none(frame))
     prior = Prior(np.eye(3), np.pi)
-    every = by_levels.match(spots, frame, prior, RegistrationOptions()).hypotheses
+    problem, matcher = Problem(spots, frame, prior, 4, -6.0), ByLevels(frame)
+    every = matcher.match(problem).hypotheses
     assert len(every) == 2
-    strict = RegistrationOptions(max_log10_false_alarms=-300.0)
-    again = by_levels.match(spots, frame, prior, strict, known=every[:1]).hypotheses
+    strict = replace(problem, max_log10_false_alarms=-300.0)
+    again = matcher.match_anywhere(strict, known=every[:1]).hypotheses
     # So strict a caller is told of more: of those of all rods, the twin must be one.
     assert sum(one.inliers == 7 for one in again) == 2

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from stereoreg_ros import RegistrationOptions
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.geometry.visibility import may_show, must_show
 from stereoreg_ros.matching import consensus
-from stereoreg_ros.matching.consensus import MISSING_COST, count_missing, decades_apart, evidence, judged, near_misses
+from stereoreg_ros.matching.consensus import MISSING_COST, count_missing, evidence, judged, near_misses
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.prior import Prior
+from stereoreg_ros.matching.problem import Problem
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
 
@@ -213,7 +213,7 @@ class TestNearMisses:
 
 @pytest.mark.parametrize(("allowed", "apart"), [(-6.0, 3.0), (-2.5, 1.25), (-1.0, 1.0), (0.0, 1.0)])
 def test_poses_are_told_apart_by_half_the_decades_by_which_chance_is_ruled_out(allowed: float, apart: float) -> None:
-    assert decades_apart(RegistrationOptions(max_log10_false_alarms=allowed)) == apart
+    assert Problem(spots(PLACES), frame(), Prior(np.eye(3), 1.0), 4, allowed).decades_apart == apart
 
 
 class TestRivals:

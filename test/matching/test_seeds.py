@@ -12,7 +12,8 @@ from stereoreg_ros.matching.prior import Near, Prior
 from stereoreg_ros.matching.seeds import _predict, spot_triples
 from stereoreg_ros.matching.spots import Spots
 from stereoreg_ros.matching.tolerances import Tolerances
-from stereoreg_ros.solvers.three_rods import PAIRS, Seeds, ThreeLineSolver
+from stereoreg_ros.solvers.distance_equations import PAIRS
+from stereoreg_ros.solvers.three_rods import Seeds, ThreeRodSolver
 from support.frames import random_frame, random_slice_from_frame
 
 TOLERANCE_MM, SLACK_MM = 0.3, 1.0
@@ -20,8 +21,8 @@ LINES = (4, 0, 2)
 OTHERS = np.array([1, 3, 5])
 
 
-def solver_of(frame: Frame, tolerance_mm: float = TOLERANCE_MM) -> ThreeLineSolver:
-    return ThreeLineSolver(frame, LINES, tolerance_mm, SLACK_MM, 0.2)
+def solver_of(frame: Frame, tolerance_mm: float = TOLERANCE_MM) -> ThreeRodSolver:
+    return ThreeRodSolver(frame, LINES, tolerance_mm, SLACK_MM, 0.2)
 
 
 def distances(points: Array) -> Array:
@@ -34,7 +35,7 @@ class TestCells:
     """Positions all over the cells of the rods, their corners among them."""
 
     @staticmethod
-    def positions(solver: ThreeLineSolver, rng: np.random.Generator, count: int) -> Array:
+    def positions(solver: ThreeRodSolver, rng: np.random.Generator, count: int) -> Array:
         """(cells, count, 3) mm."""
         shares = rng.uniform(-0.5, 0.5, (count, 3))
         shares[: count // 2] = np.sign(shares[: count // 2]) / 2

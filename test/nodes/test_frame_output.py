@@ -17,6 +17,7 @@ from std_msgs.msg import Header
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.register.frame_output import FrameOutput, FrameTopics
 from stereoreg_ros.nodes.register.targets import TargetInFrame
 from stereoreg_ros.options import RegistrationOptions
@@ -29,12 +30,11 @@ IN_SCANNER = Pose(rotation_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([1.25,
 COVARIANCE = np.diag([1.0, 4.0, 9.0, 1e-4, 4e-4, 9e-4]) + 0.25 * np.eye(6, k=1) + 0.25 * np.eye(6, k=-1)
 ACCEPTED = Registration(
     FRAME,
-    PixelScale(0.4, 0.7),
+    SliceSpots(np.zeros((9, 2)), PixelScale(0.4, 0.7)),
     RegistrationOptions(),
-    np.zeros((9, 2)),
     PoseEstimate(IN_SLICE, IN_SCANNER, COVARIANCE, (), 0.0, -9.0),
 )
-REFUSED = Refusal(FRAME, PixelScale(0.4, 0.7), np.zeros((9, 2)), "no_consensus", "nothing fits")
+REFUSED = Refusal(FRAME, SliceSpots(np.zeros((9, 2)), PixelScale(0.4, 0.7)), "no_consensus", "nothing fits")
 
 
 class Output:

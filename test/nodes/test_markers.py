@@ -17,6 +17,7 @@ from stereoreg_ros import RegistrationOptions
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.common.conversions import pose_from_message
 from stereoreg_ros.nodes.register.markers import markers_of
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
@@ -44,7 +45,9 @@ def registration(covariance: Array = COVARIANCE) -> Registration:
     )
     estimate = PoseEstimate(SLICE.scanner_from_slice.inverse() @ POSE, POSE, covariance, matches, 1.0, -9.0)
     spots_px = np.array([[0.0, 20.0], [4.0, 10.0], [1.0, 1.0]])
-    return Registration(FRAME, SLICE.scale, RegistrationOptions(target_in_frame_mm=TARGET), spots_px, estimate)
+    return Registration(
+        FRAME, SliceSpots(spots_px, SLICE.scale), RegistrationOptions(target_in_frame_mm=TARGET), estimate
+    )
 
 
 def shown(kind: int, covariance: Array = COVARIANCE) -> list[Marker]:
@@ -70,7 +73,7 @@ def test_everything_shown_before_goes_first_and_nothing_has_the_name_and_number_
 
 
 def test_of_a_refused_frame_nothing_is_shown_but_the_slice() -> None:
-    refusal = Refusal(FRAME, SLICE.scale, np.zeros((0, 2)), "no_consensus", "", ())
+    refusal = Refusal(FRAME, SliceSpots(np.zeros((0, 2)), SLICE.scale), "no_consensus", "", ())
     found = markers_of(SLICE, [(refusal, "three")], HEADER).markers
     assert [(one.action, one.ns) for one in found] == [(Marker.DELETEALL, ""), (Marker.ADD, "slice")]
 

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal, Sighting
+from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.register import recalibration
 from stereoreg_ros.nodes.register.recalibration import Recalibration
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 
 DEADLINE_S = 100.0
 SCALE = PixelScale(0.5, 0.6, 0.01)
-ONE, TWO, THREE = (Sighting(np.full((6, 2), float(k)), np.zeros((6, 2, 2))) for k in range(3))
+ONE, TWO, THREE = (SliceSpots(np.full((6, 2), float(k)), SCALE) for k in range(3))
 MEASURED = Calibration(SCALE, SCALE, (0.0, 0.0), np.zeros((2, 2)), (0.0, 0.0), 1, 6, 0.0, 0.0, (), "measured")
 
 
@@ -26,12 +27,12 @@ class Measuring:
     """Stands for `calibrate`: notes what it was called with, and answers as it is told."""
 
     def __init__(self) -> None:
-        self.calls: list[tuple[tuple[Sighting, ...], tuple[Any, ...]]] = []
+        self.calls: list[tuple[tuple[SliceSpots, ...], tuple[Any, ...]]] = []
         self.answers: list[Calibration | CalibrationRefusal | Exception] = []
         self.progress: Callable[[float], bool] | None = None
 
     def __call__(
-        self, sightings: Sequence[Sighting], *told: Any, progress: Callable[[float], bool]
+        self, sightings: Sequence[SliceSpots], *told: Any, progress: Callable[[float], bool]
     ) -> Calibration | CalibrationRefusal:
         self.calls.append((tuple(sightings), told))
         self.progress = progress
@@ -55,7 +56,7 @@ def begun(options: RegistrationOptions | None = None, calibration: CalibrationOp
 
 
 def after_the_attempt(
-    running: Recalibration, sightings: Sequence[Sighting], now_s: float
+    running: Recalibration, sightings: Sequence[SliceSpots], now_s: float
 ) -> Calibration | CalibrationRefusal | None:
     """What it answers once the measurement that it has begun is done."""
     assert running._attempt is not None

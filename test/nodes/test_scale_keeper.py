@@ -14,8 +14,9 @@ pytest.importorskip("rclpy", reason="ROS 2 is not there")
 from rcl_interfaces.msg import SetParametersResult
 
 from stereoreg_ros import PixelScale, load_frame
-from stereoreg_ros.calibration.calibrate import Calibration, Sighting
+from stereoreg_ros.calibration.calibrate import Calibration
 from stereoreg_ros.calibration.file import CalibrationRecord, load_calibration, save_calibration
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.register.scale_keeper import ScaleKeeper
 from stereoreg_ros.options import CalibrationOptions
 
@@ -67,8 +68,8 @@ def saved(path: Path) -> str:
     return str(path)
 
 
-def sighting(number: float = 0.0) -> Sighting:
-    return Sighting(np.full((4, 2), number), np.zeros((4, 2, 2)))
+def sighting(number: float = 0.0, stated: PixelScale | None = None) -> SliceSpots:
+    return SliceSpots(np.full((4, 2), number), CONFIGURED, stated_scale=stated)
 
 
 def calibration(scale: PixelScale = MEASURED) -> Calibration:
@@ -131,7 +132,7 @@ def test_measured_from_slices_that_state_their_scale(tmp_path: Path) -> None:
     path = tmp_path / "scale.yaml"
     stand = Stand(OTHER, str(path))
     keeper = stand.keeper
-    keeper.add(sighting(), CONFIGURED)
+    keeper.add(sighting(stated=CONFIGURED))
     assert cast("Any", keeper.to_measure).scale == CONFIGURED
     assert keeper.take(calibration(), FRAME) == (True, "measured")
     assert stand.in_use(CONFIGURED) == (MEASURED, "measured")
@@ -148,7 +149,7 @@ def test_measured_from_slices_that_state_their_scale(tmp_path: Path) -> None:
 def test_measured_from_images_without_a_spacing_and_measured_again() -> None:
     stand = Stand(CONFIGURED)
     keeper = stand.keeper
-    keeper.add(sighting(), None)
+    keeper.add(sighting())
     assert keeper.take(calibration(), FRAME) == (True, "measured")
     assert (stand.settings.scale, stand.in_use()) == (MEASURED, (MEASURED, "measured"))
     again = PixelScale(0.403, 0.597, 0.012)
@@ -161,7 +162,7 @@ def test_measured_from_images_without_a_spacing_and_measured_again() -> None:
 
 def test_set_anew_by_hand_what_was_measured_and_not_kept_in_a_file_is_forgotten() -> None:
     stand = Stand(CONFIGURED)
-    stand.keeper.add(sighting(), None)
+    stand.keeper.add(sighting())
     assert stand.keeper.take(calibration(), FRAME)[0]
     stand.configure(CONFIGURED)
     assert stand.in_use() == (CONFIGURED, "configured")
@@ -173,7 +174,7 @@ def test_a_measured_scale_that_cannot_be_set_is_not_used(tmp_path: Path) -> None
     stand.keeper.load()
     assert stand.in_use() == (CONFIGURED, "configured")
     assert stand.warnings[-1].endswith("scale.yaml: no")
-    stand.keeper.add(sighting(), None)
+    stand.keeper.add(sighting())
     assert stand.keeper.take(calibration(), FRAME) == (False, "the measured scale cannot be set: no")
     assert stand.in_use() == (CONFIGURED, "configured")
 
@@ -186,20 +187,20 @@ def test_the_last_slices_are_kept_however_many_they_may_be() -> None:
     keeper = Stand(CONFIGURED).keeper
     slices = [sighting(float(k)) for k in range(13)]
     for one in slices[:12]:
-        keeper.add(one, None)
+        keeper.add(one)
     assert list(keeper.sightings) == slices[2:12]  # ten by default
     keeper.keep_slices(3)
     assert list(keeper.sightings) == slices[9:12]
-    keeper.add(slices[12], None)
+    keeper.add(slices[12])
     assert list(keeper.sightings) == slices[10:]
 
 
 def test_slices_of_another_scale_are_not_measured_with_those_before() -> None:
     keeper = Stand(CONFIGURED).keeper
-    one, two, three = (sighting(float(k)) for k in range(3))
-    keeper.add(one, None)
-    keeper.add(two, OTHER)
+    two, three = (sighting(float(k), OTHER) for k in (2, 3))
+    keeper.add(sighting())
+    keeper.add(two)
     assert list(keeper.sightings) == [two]
     assert cast("Any", keeper.to_measure).scale == OTHER
-    keeper.add(three, OTHER)
+    keeper.add(three)
     assert list(keeper.sightings) == [two, three]

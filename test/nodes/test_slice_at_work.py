@@ -112,7 +112,7 @@ def test_a_slice_is_registered_again_with_the_frame_that_is_set_meanwhile(here: 
     here.set(frame_file="cube5")
     here.worker.finish()
     here.worker.finish()
-    assert [one.frames[0].name for one in here.worker.setups] == ["cube6", "cube5"]
+    assert [one.registrars[0].frame.name for one in here.worker.setups] == ["cube6", "cube5"]
     assert here.outcomes != [("registration", "")]
 
 

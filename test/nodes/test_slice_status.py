@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.common.diagnostic_status import NAME
 from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse
 from stereoreg_ros.nodes.register.slice_registration import Unusable
@@ -37,7 +38,7 @@ def values_of(status: DiagnosticStatus) -> dict[str, Any]:
 
 def test_an_accepted_slice_is_ok_and_one_with_a_caution_a_warning() -> None:
     for caution, level, more in (("", DiagnosticStatus.OK, ""), ("look twice", DiagnosticStatus.WARN, "; look twice")):
-        result = Registration(FRAME, SCALE, RegistrationOptions(), SPOTS, ESTIMATE, caution)
+        result = Registration(FRAME, SliceSpots(SPOTS, SCALE), RegistrationOptions(), ESTIMATE, caution)
         status = status_of(result, "measured", 0.0125, "ct")
         assert status.level == level
         assert status.message == f"registered 5 of 6 rods, residual 0.25 mm{more}"
@@ -49,7 +50,7 @@ def test_an_accepted_slice_is_ok_and_one_with_a_caution_a_warning() -> None:
 
 
 def test_a_refused_slice_is_an_error_with_its_sentence() -> None:
-    result = Refusal(FRAME, SCALE, SPOTS, "no_consensus", "nothing fits")
+    result = Refusal(FRAME, SliceSpots(SPOTS, SCALE), "no_consensus", "nothing fits")
     status = status_of(result, "configured", 0.5, "ct")
     assert (status.level, status.message) == (DiagnosticStatus.ERROR, "nothing fits")
     values = values_of(status)
@@ -63,7 +64,8 @@ def test_an_image_that_never_came_to_registration_has_the_same_keys_and_nothing_
     values = values_of(status)
     assert list(values) == list(DIAGNOSTIC_KEYS)
     assert list(values) == [
-        entry.key for entry in status_of(Refusal(FRAME, SCALE, SPOTS, "bad_image", ""), "", 0.0, "ct").values
+        entry.key
+        for entry in status_of(Refusal(FRAME, SliceSpots(SPOTS, SCALE), "bad_image", ""), "", 0.0, "ct").values
     ]
     known = {
         "outcome": "refused",

@@ -20,6 +20,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from stereoreg_ros import Pose, load_frame
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.common import conversions
 from stereoreg_ros.nodes.register import register_node
 from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice
@@ -49,7 +50,7 @@ ERROR_MM = error_ball_95(COVARIANCE[:3, :3])
 def latest(frame_id: str = "ct") -> Accepted:
     """A pose whose slice came at 100 s. Of the slice it has another, which no target rests on."""
     estimate = PoseEstimate(Pose.identity(), SCANNER_FROM_FRAME, COVARIANCE, (), 0.0, -12.0)
-    result = Registration(CUBE, SCALE, RegistrationOptions(), np.zeros((0, 2)), estimate)
+    result = Registration(CUBE, SliceSpots(np.zeros((0, 2)), SCALE), RegistrationOptions(), estimate)
     return Accepted(Header(stamp=Time(sec=7, nanosec=8), frame_id=frame_id), result, 100.0)
 
 

@@ -13,6 +13,7 @@ from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import point_line_distances, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 
@@ -44,7 +45,7 @@ def an_estimate(pose: Pose = POSE) -> tuple[PoseEstimate, Array]:
 
 def accepted(pose: Pose = POSE, caution: str = "") -> Registration:
     estimate, spots = an_estimate(pose)
-    return Registration(FRAME, SCALE, RegistrationOptions(), spots, estimate, caution)
+    return Registration(FRAME, SliceSpots(spots, SCALE), RegistrationOptions(), estimate, caution)
 
 
 def count(picture: NDArray[np.uint8], colour: tuple[int, int, int], pixel: Array, zoom: int) -> int:
@@ -91,7 +92,9 @@ class TestColours:
         # So far along that rods end before the slice: none of them is inside.
         estimate, spots = an_estimate()
         away = Pose(POSE.rotation, POSE.translation + np.array([0.0, 0.0, 100.0]))
-        result = Registration(FRAME, SCALE, RegistrationOptions(), spots, replace(estimate, slice_from_frame=away))
+        result = Registration(
+            FRAME, SliceSpots(spots, SCALE), RegistrationOptions(), replace(estimate, slice_from_frame=away)
+        )
         picture = draw_overlay(a_slice(), result)
         assert (np.abs(picture.astype(int) - BLUE).max(axis=-1) <= 6).sum() == 0
 
@@ -106,7 +109,7 @@ class TestColours:
         match = Match("a", matched, 0, spots[0], predicted[matched], 0.0)
         estimate = PoseEstimate(pose, pose, 1e-4 * np.eye(6), (match,), 5.0, -20.0)
         ct_slice = Slice(a_slice((200, 300)).hu, scale)
-        picture = draw_overlay(ct_slice, Registration(FRAME, scale, RegistrationOptions(), spots, estimate))
+        picture = draw_overlay(ct_slice, Registration(FRAME, SliceSpots(spots, scale), RegistrationOptions(), estimate))
         assert picture.shape == (4 * 200 + HEADER, 4 * 300, 3)
         for place, colour in ((spots[0], GREEN), (spots[1], YELLOW), (predicted[missing], BLUE)):
             assert count(picture, colour, place, self.ZOOM) > 30
@@ -115,7 +118,7 @@ class TestColours:
     def test_the_headline_says_the_outcome(self) -> None:
         good, doubtful = draw_overlay(a_slice(), accepted()), draw_overlay(a_slice(), accepted(caution="a caution"))
         estimate, spots = an_estimate()
-        bad = draw_overlay(a_slice(), Refusal(FRAME, SCALE, spots, "ambiguous", "two poses", (estimate,)))
+        bad = draw_overlay(a_slice(), Refusal(FRAME, SliceSpots(spots, SCALE), "ambiguous", "two poses", (estimate,)))
         for picture, colour in ((good, GREEN), (doubtful, YELLOW), (bad, RED)):
             # Letters are thin and anti-aliased, how much depends on OpenCV: colours count by their tint.
             text = picture[:HEADER].reshape(-1, 3).astype(float)
@@ -141,27 +144,29 @@ class TestPicture:
 
     @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 2), (1, 40), (2048, 2048)])
     def test_tiny_and_large_images(self, shape: tuple[int, int]) -> None:
-        for result in (accepted(), Refusal(FRAME, SCALE, FALSE_SPOTS, "no_consensus", "none")):
+        for result in (accepted(), Refusal(FRAME, SliceSpots(FALSE_SPOTS, SCALE), "no_consensus", "none")):
             picture = draw_overlay(a_slice(shape), result)
             assert picture.ndim == 3
             assert picture.shape[1] >= 1024
 
     def test_a_refusal_without_explanation_shows_the_spots_alone(self) -> None:
-        picture = draw_overlay(a_slice(), Refusal(FRAME, SCALE, FALSE_SPOTS, "no_consensus", "none"))
+        picture = draw_overlay(a_slice(), Refusal(FRAME, SliceSpots(FALSE_SPOTS, SCALE), "no_consensus", "none"))
         for spot in FALSE_SPOTS:
             assert count(picture, YELLOW, spot, 4) > 30
         for colour in (GREEN, BLUE):
             assert (np.abs(picture.astype(int) - colour).max(axis=-1) <= 6).sum() == 0
 
     def test_a_refusal_without_spots(self) -> None:
-        picture = draw_overlay(a_slice(), Refusal(FRAME, SCALE, np.empty((0, 2)), "too_few_spots", "none"))
+        picture = draw_overlay(a_slice(), Refusal(FRAME, SliceSpots(np.empty((0, 2)), SCALE), "too_few_spots", "none"))
         assert picture[HEADER:].std() > 0
         assert (np.abs(picture.astype(int) - YELLOW).max(axis=-1) <= 6).sum() == 0
 
     def test_a_refusal_shows_its_best_explanation(self) -> None:
         estimate, spots = an_estimate()
         other, _ = an_estimate(Pose(POSE.rotation, POSE.translation + np.array([30.0, 20.0, 0.0])))
-        picture = draw_overlay(a_slice(), Refusal(FRAME, SCALE, spots, "ambiguous", "two poses", (estimate, other)))
+        picture = draw_overlay(
+            a_slice(), Refusal(FRAME, SliceSpots(spots, SCALE), "ambiguous", "two poses", (estimate, other))
+        )
         for match in estimate.matches:
             assert count(picture, GREEN, match.spot_px, 4) > 30
 
@@ -175,9 +180,8 @@ class TestPicture:
         frame = load_frame("leksell_ct")
         lying = Pose(rotation_exp(np.array([np.pi / 2, 0.0, 0.0])), np.zeros(3))
         matches = tuple(match for match in estimate.matches if match.line_index == 1)
-        result = Refusal(
-            frame, SCALE, spots, "degenerate", "-", (replace(estimate, slice_from_frame=lying, matches=matches),)
-        )
+        lying_in_it = replace(estimate, slice_from_frame=lying, matches=matches)
+        result = Refusal(frame, SliceSpots(spots, SCALE), "degenerate", "-", (lying_in_it,))
         assert draw_overlay(a_slice(), result).shape == (256 * 4 + HEADER, 1024, 3)
 
     def test_a_flat_image_and_one_spike(self) -> None:
@@ -207,8 +211,8 @@ class TestSeveralFrames:
         estimate, spots = an_estimate(pose)
         second = replace(FRAME, name="second")
         return (
-            replace(first, spots_px=np.concatenate([first.spots_px, spots[: len(estimate.matches)]])),
-            Registration(second, SCALE, RegistrationOptions(), spots[:-1], estimate),
+            replace(first, spots=SliceSpots(np.concatenate([first.spots_px, spots[: len(estimate.matches)]]), SCALE)),
+            Registration(second, SliceSpots(spots[:-1], SCALE), RegistrationOptions(), estimate),
         )
 
     def near(self, picture: NDArray[np.uint8], colour: tuple[int, int, int], pixel: Array) -> int:
@@ -235,7 +239,7 @@ class TestSeveralFrames:
 
     def test_each_has_its_own_headline(self) -> None:
         first, second = self.results()
-        refused = Refusal(second.frame, SCALE, second.spots_px, "ambiguous", "two poses", (second.estimate,))
+        refused = Refusal(second.frame, second.spots, "ambiguous", "two poses", (second.estimate,))
         for one, other in ((first, refused), (refused, first)):
             picture = draw_overlay(a_slice(), [one, other])
             head = picture[: self.HEADER].astype(int)

@@ -4,37 +4,36 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoreg_ros import Pose, RegistrationOptions, judgement, load_frame, register_spots, registration
+from stereoreg_ros import Pose, RegistrationOptions, judgement, load_frame, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.judgement import (
     DEGENERATE_ROTATION_DEG,
     MAX_SPOTS,
     WEAK_POSITION_MM,
     WEAK_ROTATION_DEG,
+    Case,
     Verdict,
     check_count,
     check_orientation,
-    contradicted_orientation,
     judge,
-    other_scale,
-    second_frame,
 )
-from stereoreg_ros.matching import by_levels
-from stereoreg_ros.matching.by_levels import SearchGivenUpError
+from stereoreg_ros.matching import level_search, rivals
+from stereoreg_ros.matching.by_levels import ByLevels
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Found, Hypothesis
+from stereoreg_ros.matching.level_search import LevelSearch, SearchGivenUpError
 from stereoreg_ros.matching.other_scale import OtherScale
-from stereoreg_ros.matching.prior import Prior
-from stereoreg_ros.matching.spots import Spots
+from stereoreg_ros.matching.problem import Problem
+from stereoreg_ros.matching.rivals import Rivals
 from stereoreg_ros.result import Match, PoseEstimate, Refusal, Registration
 from stereoreg_ros.simulation import ScannerSettings, centred_pose, random_pose
 from stereoreg_ros.simulation.mistakes import Surroundings, contradicted_prior, sister
@@ -65,8 +64,32 @@ def hypothesis(rods: int = 6, pose: Pose | None = None, near_misses: float = 0.0
     return Hypothesis(where.rotation, where.translation, spot_of_line, 1.0, np.eye(6), 0, near_misses, pieces)
 
 
-def nothing_else() -> Verdict | None:
-    return None
+class Told(Rivals):
+    """Rivals as they are told; notes which were asked for."""
+
+    def __init__(
+        self,
+        scale: OtherScale | None = None,
+        orientation: Hypothesis | None = None,
+        second: Hypothesis | None = None,
+        given_up: bool = False,
+    ) -> None:
+        self.scale, self.orientation, self.second, self.given_up = scale, orientation, second, given_up
+        self.asked: list[str] = []
+
+    def other_scale(self) -> OtherScale | None:
+        self.asked.append("scale")
+        return self.scale
+
+    def beyond_prior(self) -> Hypothesis | None:
+        self.asked.append("orientation")
+        if self.given_up:
+            raise SearchGivenUpError
+        return self.orientation
+
+    def second_frame(self) -> Hypothesis | None:
+        self.asked.append("second")
+        return self.second
 
 
 def judged(
@@ -74,10 +97,23 @@ def judged(
     options: RegistrationOptions = STANDING,
     near_misses: float = 0.0,
     pieces: float = 0.0,
-    rivals: Callable[[], Verdict | None] = nothing_else,
+    rivals: Told | None = None,
 ) -> Verdict:
-    found = Found([hypothesis(near_misses=near_misses, pieces=pieces), *[hypothesis() for _ in estimates[1:]]], 4)
-    return judge(found, estimates, FRAME, SPOTS, options, rivals)
+    best = hypothesis(estimates[0].inliers, near_misses=near_misses, pieces=pieces)
+    found = Found([best, *[hypothesis() for _ in estimates[1:]]], 4)
+    return judge(case_of(found, estimates, options=options, rivals=rivals))
+
+
+def case_of(
+    found: Found,
+    estimates: tuple[PoseEstimate, ...] = (),
+    frame: Frame = FRAME,
+    spots: int = SPOTS,
+    options: RegistrationOptions = STANDING,
+    rivals: Told | None = None,
+) -> Case:
+    problem = Problem.of(SliceSpots(np.zeros((spots, 2)), SCALE), frame, options)
+    return Case(problem, options, found, estimates, rivals or Told())
 
 
 def with_errors(position_mm: float, rotation_deg: float) -> PoseEstimate:
@@ -180,7 +216,7 @@ class TestChance:
 
 class TestNothingFound:
     def test_a_search_given_up_says_why(self) -> None:
-        verdict = judge(Found([], 5, "given up: a reason"), (), FRAME, 120, STANDING, nothing_else)
+        verdict = judge(case_of(Found([], 5, "given up: a reason"), spots=120))
         assert verdict.reason == "no_consensus"
         assert "120 spots was given up: a reason" in verdict.message
 
@@ -193,7 +229,7 @@ class TestNothingFound:
         ],
     )
     def test_says_how_far_was_searched(self, least_rods: int, told: str) -> None:
-        verdict = judge(Found([], least_rods), (), FRAME, SPOTS, STANDING, nothing_else)
+        verdict = judge(case_of(Found([], least_rods)))
         assert verdict.reason == "no_consensus"
         assert re.search(told, verdict.message), verdict.message
 
@@ -225,7 +261,7 @@ class TestResidual:
         # The frame file's own tolerance counts before the option, and the largest of them.
         own = replace(FRAME, tolerances_mm=np.array([0.1, 0.1, 0.7, 0.1, 0.1, 0.1]))
         found = Found([hypothesis()], 4)
-        verdict = judge(found, [replace(estimate(), chi_square=99.0)], own, SPOTS, options, nothing_else)
+        verdict = judge(case_of(found, (replace(estimate(), chi_square=99.0),), own, options=options))
         assert "frame tolerance of 0.7 mm" in verdict.message
 
 
@@ -369,12 +405,7 @@ def test_pieces(pieces: float, reason: str | None) -> None:
 
 class TestOrder:
     def test_rivals_are_sought_only_where_nothing_else_refuses(self) -> None:
-        asked = []
-
-        def rivals() -> Verdict | None:
-            asked.append(True)
-            return Verdict("contradicted", "another one")
-
+        rivals = Told(second=hypothesis(5))
         for one in (
             replace(estimate(), log10_false_alarms=0.0),
             replace(estimate(), chi_square=99.0),
@@ -383,10 +414,10 @@ class TestOrder:
         ):
             assert judged(one, rivals=rivals).reason in ("no_consensus", "inaccurate", "degenerate")
         assert judged(estimate(), estimate(), rivals=rivals).reason == "ambiguous"
-        assert judged(estimate(), near_misses=99.0, rivals=rivals).message != "another one"
-        assert asked == []
-        assert judged(estimate(), rivals=rivals) == Verdict("contradicted", "another one")
-        assert asked == [True]
+        assert judged(estimate(), near_misses=99.0, rivals=rivals).reason == "contradicted"
+        assert rivals.asked == []
+        assert "shows the frame twice" in judged(estimate(), rivals=rivals).message
+        assert rivals.asked == ["scale", "orientation", "second"]
 
     def test_chance_comes_first(self) -> None:
         """What chance could bring has no residual to be judged, and twins."""
@@ -398,31 +429,44 @@ class TestOrder:
         assert verdict.reason == "no_consensus"
 
 
-class TestSentencesOfRivals:
-    def test_contradicted_orientation(self) -> None:
+class TestRivals:
+    """One after the other, each with its figures."""
+
+    WRONG = np.array([0.051, -0.004])
+
+    def test_of_another_orientation(self) -> None:
         other = Pose(rotation_exp(np.array([0.0, 0.0, math.radians(170.0)])), np.zeros(3))
-        prior = Prior(np.eye(3), math.radians(30.0))
-        verdict = contradicted_orientation(hypothesis(5), hypothesis(6, other), prior, 8)
+        options = replace(STANDING, max_rotation_deg=30.0)
+        verdict = judged(estimate(5), options=options, rivals=Told(orientation=hypothesis(6, other)))
         assert verdict.reason == "contradicted"
-        assert "5 of 8 rods match within 30 degrees of nominal_orientation, but 6" in verdict.message
+        assert "5 of 6 rods match within 30 degrees of nominal_orientation, but 6" in verdict.message
         assert "at 170 degrees" in verdict.message
 
-    def test_other_scale(self) -> None:
+    def test_of_another_scale(self) -> None:
         """Refused from a thousand to one."""
-        wrong = np.array([0.051, -0.004])
-        verdict = other_scale(hypothesis(5), OtherScale(6, wrong, math.log(1001)), 8)
-        assert verdict is not None
+        verdict = judged(estimate(5), rivals=Told(OtherScale(6, self.WRONG, math.log(1001))))
         assert verdict.reason == "contradicted"
-        assert "5 of 8 rods match with the stated pixel spacing, but 6" in verdict.message
+        assert "5 of 6 rods match with the stated pixel spacing, but 6" in verdict.message
         assert "changed by -5.1 % along x and +0.4 % along y: check pixel_spacing" in verdict.message
-        assert other_scale(hypothesis(5), OtherScale(6, wrong, math.log(999)), 8) is None
-        assert other_scale(hypothesis(5), None, 8) is None
+        assert judged(estimate(5), rivals=Told(OtherScale(6, self.WRONG, math.log(999)))).reason is None
 
-    def test_second_frame(self) -> None:
+    def test_a_second_frame(self) -> None:
         other = Pose(np.eye(3), np.array([30.0, 40.0, 0.0]))
-        verdict = second_frame(hypothesis(6), hypothesis(5, other), 6)
+        verdict = judged(estimate(6), rivals=Told(second=hypothesis(5, other)))
         assert verdict.reason == "ambiguous"
         assert "twice: 6 of 6 rods match, and 5 of them match other spots with the frame 50 mm away" in verdict.message
+
+    def test_what_refuses_first_ends_the_search(self) -> None:
+        rivals = Told(OtherScale(6, self.WRONG, 50.0), hypothesis(6), hypothesis(5))
+        assert "pixel spacing" in judged(estimate(5), rivals=rivals).message
+        assert rivals.asked == ["scale"]
+
+    def test_a_search_that_takes_too_long_is_no_acceptance(self) -> None:
+        verdict = judged(estimate(5), rivals=Told(given_up=True))
+        assert verdict.reason == "no_consensus"
+        assert "a pose of 5 rods was found, but the search for one that contradicts it among 9 spots took too long" in (
+            verdict.message
+        )
 
 
 def noisy(rng: np.random.Generator, frame: Frame, pose: Pose) -> Array:
@@ -514,7 +558,7 @@ class TestSlices:
     def test_a_search_that_takes_too_long_is_refused_and_says_so(self, monkeypatch: pytest.MonkeyPatch) -> None:
         spots = noisy(np.random.default_rng(6), FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
         assert register_spots(spots, FRAME, SCALE, STANDING)
-        monkeypatch.setattr(by_levels, "_MOST_WORK", 1.0)
+        monkeypatch.setattr(level_search, "_MOST_WORK", 1.0)
         result = register_spots(spots, FRAME, SCALE, STANDING)
         assert not result
         assert result.reason == "no_consensus"
@@ -527,7 +571,7 @@ class TestSlices:
             raise SearchGivenUpError
 
         spots = noisy(np.random.default_rng(6), FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
-        monkeypatch.setattr(by_levels._Search, "twins_of", endless)
+        monkeypatch.setattr(LevelSearch, "twins_of", endless)
         result = register_spots(spots, FRAME, SCALE, STANDING)
         assert not result
         assert "given up" in result.message
@@ -540,7 +584,7 @@ class TestSlices:
             raise SearchGivenUpError
 
         spots = noisy(np.random.default_rng(6), FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
-        monkeypatch.setattr(registration, "find_better", endless)
+        monkeypatch.setattr(ByLevels, "find_better", endless)
         result = register_spots(spots, FRAME, SCALE, STANDING)
         assert not result
         assert result.reason == "no_consensus"
@@ -555,11 +599,11 @@ class TestSlices:
         """Elsewhere only what is told apart from the best; of what is left, where it may be a frame, one rod less."""
         asked: list[tuple[object, ...]] = []
 
-        def nothing(spots: Spots, _: Frame, prior: Prior, *more: object, **named: object) -> None:
-            asked.append((len(spots.mm), math.degrees(prior.max_rotation), *more[1:], named))
+        def nothing(_: ByLevels, problem: Problem, *more: object, **named: object) -> None:
+            asked.append((len(problem.spots.mm), math.degrees(problem.prior.max_rotation), *more, named))
 
-        monkeypatch.setattr(registration, "find_better", nothing)
-        monkeypatch.setattr(registration, "score", lambda *_: 100.0)
+        monkeypatch.setattr(ByLevels, "find_better", nothing)
+        monkeypatch.setattr(rivals, "score", lambda *_: 100.0)
         rng = np.random.default_rng(6)
         spots = noisy(rng, FRAME, random_pose(np.random.default_rng(6), FRAME, SCANNER))
         spots = np.concatenate([rng.uniform(0, 60, (left, 2)), spots])
@@ -577,7 +621,7 @@ class TestSlices:
         options = RegistrationOptions(max_rotation_deg=max_rotation_deg)
         assert register_spots(spots[:5], FRAME, SCALE, options, slice_area_mm2=AREA_MM2)
         found = OtherScale(6, np.array([0.03, 0.03]), 50.0)
-        monkeypatch.setattr(registration, "with_other_scale", lambda *_: found)
+        monkeypatch.setattr(rivals, "with_other_scale", lambda *_: found)
         result = register_spots(spots[:5], FRAME, SCALE, options, slice_area_mm2=AREA_MM2)
         assert not result
         assert result.reason == "contradicted"
@@ -621,14 +665,15 @@ class TestSlices:
             scale_tolerance=0.0,
         )
 
-        def widening(*given: object) -> Found:
-            (one,) = by_levels.match(*given).hypotheses  # type: ignore[arg-type]
+        def widening(matcher: ByLevels, problem: Problem) -> Found:
+            (one,) = match(matcher, problem).hypotheses
             widened = replace(one, information=one.information / 2, is_widened=True)
             widest.append(np.asarray(np.linalg.inv(widened.information), dtype=np.float64))
             return Found([widened], 5)
 
         widest: list[Array] = []
-        monkeypatch.setitem(registration._MATCHERS, "three_line", widening)
+        match = ByLevels.match
+        monkeypatch.setattr(ByLevels, "match", widening)
         result = register_spots(spots, frame, SCALE, options, slice_area_mm2=AREA_MM2)
         assert result
         assert "weakly determined" in result.caution

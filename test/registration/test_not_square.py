@@ -14,7 +14,8 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
-from stereoreg_ros.registration import _streaks
+from stereoreg_ros.geometry.spots import SliceSpots
+from stereoreg_ros.matching.spots import Streaks
 from stereoreg_ros.result import Registration
 from stereoreg_ros.simulation import (
     Cylinder,
@@ -31,7 +32,7 @@ from stereoreg_ros.simulation import (
 from stereoreg_ros.simulation.mistakes import NO_ROD, Surroundings, true_scene, wrong_spacing
 from stereoreg_ros.simulation.patient import AIR_HU, background
 from stereoreg_ros.simulation.scene import BLOCK_HU
-from stereoreg_ros.spots import FoundSpots, find_spots
+from stereoreg_ros.spots import find_spots
 
 SHAPE = ROWS, COLUMNS = 200, 300
 SCALE = PixelScale(0.5, 0.65, 0.04)
@@ -160,7 +161,8 @@ class TestSpots:
         image = np.full(SHAPE, 40.0)
         add_metal(image, Cylinder(middle - 30 * lean, middle + 30 * lean, 1.0), SCALE, thickness_mm, 0.45, 8000.0)
         found = find_spots(Slice(image.astype(np.float32), SCALE), RegistrationOptions())
-        streaks = _streaks(found, SCALE, thickness_mm)
+        streaks = Streaks.of(found, thickness_mm)
+        assert streaks is not None
         (along,) = streaks.along_mm
         along = along * np.sign(along @ lean[:2])
         np.testing.assert_allclose(along, thickness_mm * lean[:2], atol=0.1 * thickness_mm)
@@ -192,10 +194,10 @@ class TestSpots:
         along_mm = np.array([[6.0, 2.0], [-1.0, 9.0]])
         moments_mm2 = along_mm[:, :, None] * along_mm[:, None, :] / 12 + 0.2 * np.eye(2)
         to_px = np.linalg.inv(SCALE.matrix)
-        found = FoundSpots(
-            np.zeros((2, 2)), np.zeros((2, 2, 2)), to_px @ moments_mm2 @ to_px.T, np.array([True, False])
-        )
-        streaks = _streaks(found, SCALE, 5.0)
+        extents_px2, cut_short = to_px @ moments_mm2 @ to_px.T, np.array([True, False])
+        found = SliceSpots(np.zeros((2, 2)), SCALE, extents_px2=extents_px2, cut_short=cut_short)
+        streaks = Streaks.of(found, 5.0)
+        assert streaks is not None
         signs = np.sign((streaks.along_mm * along_mm).sum(axis=1, keepdims=True))
         np.testing.assert_allclose(signs * streaks.along_mm, along_mm, rtol=1e-9)
         assert streaks.cut_short.tolist() == [True, False]

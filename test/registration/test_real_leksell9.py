@@ -12,6 +12,7 @@ import pytest
 from stereoreg_ros import RegistrationOptions, load_frame, register_slice
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.options import AUTO
+from stereoreg_ros.registration import register_slice_spots
 from stereoreg_ros.spots import find_spots
 from support.real_images import leksell9, row_of
 from support.real_scenes import (
@@ -22,7 +23,6 @@ from support.real_scenes import (
     changed,
     height_mm,
     leksell_changes,
-    register_found,
 )
 
 THRESHOLDS = pytest.mark.parametrize("threshold", ["1000", AUTO])
@@ -75,7 +75,7 @@ def test_changes_take_and_add_what_they_say(slices, frame):
 def test_spots_are_registered_as_their_slice_is(slices, frame):
     ct_slice, options = slices[30], RegistrationOptions(threshold=1000.0, max_rotation_deg=30.0)
     direct = register_slice(ct_slice, frame, options)
-    by_spots = register_found(find_spots(ct_slice, options), ct_slice, frame, options)
+    by_spots = register_slice_spots(find_spots(ct_slice, options), frame, options)
     assert direct
     assert by_spots
     np.testing.assert_array_equal(by_spots.covariance, direct.covariance)
@@ -115,7 +115,7 @@ def test_of_two_rods_that_meet_the_one_that_shows_is_not_taken_for_the_other(sli
     for ct_slice in ends:
         for name in frame.line_names:
             found = changed(find_spots(ct_slice, options), ct_slice, frame, Change((name,)), np.random.default_rng(0))
-            result = register_found(found, ct_slice, frame, options, previous)
+            result = register_slice_spots(found, frame, options, previous)
             if result:
                 error = np.linalg.norm(result.scanner_from_frame @ LEKSELL_POINT_MM - LEKSELL_POSE @ LEKSELL_POINT_MM)
                 assert error < 2 * result.estimate.target_error_95_mm(tuple(LEKSELL_POINT_MM)), name

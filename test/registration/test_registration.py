@@ -16,9 +16,10 @@ from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import rotation_angle
 from stereoreg_ros.geometry.projection import cut, cut_jacobian, project
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.judgement import MAX_SPOTS
 from stereoreg_ros.matching.consensus import IMPLAUSIBLE
-from stereoreg_ros.registration import recognise_spots
+from stereoreg_ros.registration import recognise
 from stereoreg_ros.simulation import ScannerSettings, SpotSetSettings, centred_pose, random_pose, random_spot_set
 
 SCANNER = ScannerSettings()
@@ -414,7 +415,7 @@ class TestRecognition:
         rng = np.random.default_rng(41)
         for _ in range(8):
             spots = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 9, 0.3, gaussian=True)).spots_px
-            accepted, recognised = register_spots(spots, cube, SCALE), recognise_spots(spots, cube, SCALE)
+            accepted, recognised = register_spots(spots, cube, SCALE), recognise(SliceSpots(spots, SCALE), cube)
             assert accepted
             assert recognised is not None
             pairs = [[(match.line, match.spot) for match in one.matches] for one in (accepted, recognised)]
@@ -426,7 +427,10 @@ class TestRecognition:
         rng = np.random.default_rng(42)
         spots = random_spot_set(rng, cube, SpotSetSettings(SCANNER, 6, 9, 0.3, gaussian=True)).spots_px
         strict = RegistrationOptions(max_target_error_mm=0.01)
-        refused, recognised = register_spots(spots, cube, SCALE, strict), recognise_spots(spots, cube, SCALE, strict)
+        refused, recognised = (
+            register_spots(spots, cube, SCALE, strict),
+            recognise(SliceSpots(spots, SCALE), cube, strict),
+        )
         assert not refused
         assert refused.reason == "inaccurate"
         assert recognised is not None
@@ -435,12 +439,13 @@ class TestRecognition:
     def test_a_frame_that_asks_for_an_orientation_is_not_recognised_without(self, cube):
         asking = replace(cube, orientation_required=True)
         spots, _ = project(cube, random_pose(np.random.default_rng(43), cube, SCANNER), SCALE)
-        assert recognise_spots(spots, asking, SCALE) is None
-        assert recognise_spots(spots, asking, SCALE, RegistrationOptions(max_rotation_deg=90.0)) is not None
+        assert recognise(SliceSpots(spots, SCALE), asking) is None
+        assert recognise(SliceSpots(spots, SCALE), asking, RegistrationOptions(max_rotation_deg=90.0)) is not None
 
     def test_nothing_where_nothing_looks_like_the_frame(self, cube):
-        assert recognise_spots(np.zeros((0, 2)), cube, SCALE) is None
-        assert recognise_spots([[10.0, 10.0], [60.0, 10.0], [300.0, 300.0], [310.0, 20.0]], cube, SCALE) is None
+        assert recognise(SliceSpots(np.zeros((0, 2)), SCALE), cube) is None
+        four = np.array([[10.0, 10.0], [60.0, 10.0], [300.0, 300.0], [310.0, 20.0]])
+        assert recognise(SliceSpots(four, SCALE), cube) is None
 
 
 class TestScaleCovariance:

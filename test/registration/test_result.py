@@ -11,6 +11,7 @@ import pytest
 from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.result import REASONS, Match, PoseEstimate, Refusal, Registration, diagnostics
 from stereoreg_ros.uncertainty import error_ball_95
@@ -33,11 +34,11 @@ def estimate() -> PoseEstimate:
 
 @pytest.fixture
 def accepted() -> Registration:
-    return Registration(FRAME, SCALE, RegistrationOptions(), SPOTS, estimate())
+    return Registration(FRAME, SliceSpots(SPOTS, SCALE), RegistrationOptions(), estimate())
 
 
 def refused(estimates: tuple[PoseEstimate, ...] = ()) -> Refusal:
-    return Refusal(FRAME, SCALE, SPOTS, "no_consensus", "nothing found", estimates)
+    return Refusal(FRAME, SliceSpots(SPOTS, SCALE), "no_consensus", "nothing found", estimates)
 
 
 class TestTruth:

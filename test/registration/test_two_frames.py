@@ -7,11 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice, register_spots, registration
+from stereoreg_ros import RegistrationOptions, load_frame, register_frames, register_slice, register_spots
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.geometry.spots import SliceSpots
+from stereoreg_ros.registration import Registrar
 from stereoreg_ros.result import Refusal, Registration
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, centred_pose, random_pose, render_slice
 from stereoreg_ros.spots import find_spots
@@ -189,12 +191,14 @@ def test_one_that_is_sought_again_is_looked_for_where_it_was_itself(scenes, monk
     ct_slice, first, _ = scenes[1]
     sought = []
 
-    def recorded(seen, frame: Frame, options: RegistrationOptions, previous: Pose | None) -> Registration | Refusal:
-        sought.append((len(seen.spots_px), previous))
-        return register(seen, frame, options, previous)
+    def recorded(
+        registrar: Registrar, spots: SliceSpots, options: RegistrationOptions, previous: Pose | None
+    ) -> Registration | Refusal:
+        sought.append((len(spots), previous))
+        return register(registrar, spots, options, previous)
 
-    register = registration._register
-    monkeypatch.setattr(registration, "_register", recorded)
+    register = Registrar.register
+    monkeypatch.setattr(Registrar, "register", recorded)
     nearby = first.perturbed(np.array([0.5, 0.0, 0.0]), np.zeros(3))
     one, again = register_frames(ct_slice, [FIRST, FIRST], previous=[first, nearby])
     assert_right(one, FIRST, first)

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from stereoreg_ros import RegistrationOptions, register_spots
-from stereoreg_ros.calibration.calibrate import Calibration, Sighting, calibrate
+from stereoreg_ros.calibration.calibrate import Calibration, calibrate
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import PixelScale
-from stereoreg_ros.registration import recognise_spots
+from stereoreg_ros.geometry.spots import SliceSpots
+from stereoreg_ros.registration import recognise
+from stereoreg_ros.solvers.identified import IdentifiedSpots, ScaleAndPoses
 from stereoreg_ros.solvers.tolerant_calibration import calibrate_tolerantly
 from support.frames import cube_by_hand
 
@@ -156,7 +158,7 @@ def test_what_is_recognised_is_weighed_alike() -> None:
     frame = the_frame()
     spots, covariances, rows = offered(frame, TRUTH, 4)
     judged = register_spots(spots, frame, SCALE, OPTIONS, PLANE, covariances_px2=covariances)
-    seen = recognise_spots(spots, frame, SCALE, OPTIONS, PLANE, covariances_px2=covariances)
+    seen = recognise(SliceSpots(spots, SCALE, covariances, scanner_from_slice=PLANE), frame, OPTIONS)
     assert judged
     assert seen
     assert [match.spot for match in seen.matches] == rows[rows >= 0].tolist()
@@ -174,26 +176,24 @@ def test_the_measured_scale_is_that_of_the_same_spots_in_the_rods_order() -> Non
         Pose(rotation_exp(np.array([-0.2, 0.1, 0.5])), np.array([60.0, 130.0, -6.0])),
         Pose(rotation_exp(np.array([0.2, 0.2, 1.2])), np.array([75.0, 110.0, 5.0])),
     ]
-    sightings, spots_px, used = [], np.zeros((3, 7, 2)), np.zeros((3, 7), dtype=bool)
+    slices, spots_px, used = [], np.zeros((3, 7, 2)), np.zeros((3, 7), dtype=bool)
     covariances = np.tile(np.eye(2), (3, 7, 1, 1))
     for number, pose in enumerate(poses):
         spots, own, rows = offered(frame, pose, 10 + number)
-        sightings.append(Sighting(spots, own))
+        slices.append(SliceSpots(spots, SCALE, own))
         lines = np.flatnonzero(rows >= 0)
         spots_px[number, lines], used[number, lines] = spots[rows[lines]], True
         covariances[number, lines] = own[rows[lines]]
-    found = calibrate(sightings, frame, SCALE, OPTIONS)
+    found = calibrate(slices, frame, SCALE, OPTIONS)
     assert isinstance(found, Calibration), found.message
     assert (found.slices, found.rods) == (3, 18)
     by_hand = calibrate_tolerantly(
         frame,
         frame.tolerances_or(np.nan),
-        np.array([pose.rotation for pose in poses]),
-        np.array([pose.translation for pose in poses]),
-        spots_px,
-        used,
-        covariances,
-        SCALE,
+        IdentifiedSpots(spots_px, used, covariances),
+        ScaleAndPoses(
+            SCALE, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses])
+        ),
     )
     assert by_hand.converged
     # The shear was not to be measured.

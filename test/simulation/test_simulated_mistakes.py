@@ -193,7 +193,7 @@ def test_mirrored_rod(name: str) -> None:
         configured, true = scene.frame, scene.true_frame
         (rod,) = np.flatnonzero((configured.starts != true.starts).any(axis=1))
         mirrored.add(rod)
-        assert configured is with_rod_mirrored(true, rod)
+        assert configured == with_rod_mirrored(true, int(rod))
         lean, true_lean = ((frame.ends - frame.starts)[rod] for frame in (configured, true))
         (axis,) = np.flatnonzero(lean != true_lean)
         assert axis < 2

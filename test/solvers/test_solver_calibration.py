@@ -24,6 +24,7 @@ from stereoreg_ros.solvers.calibration import (
     calibrate_newton_raphson,
     calibration_covariance,
 )
+from stereoreg_ros.solvers.identified import IdentifiedSpots, ScaleAndPoses
 from stereoreg_ros.solvers.joint_calibration import JointScale, calibrate_jointly
 from stereoreg_ros.solvers.linear_system import MAX_CONDITION
 from stereoreg_ros.solvers.tolerant_calibration import TolerantScale, calibrate_tolerantly
@@ -298,31 +299,18 @@ class Series:
 
     def exact_frame(self, with_shear: bool = False) -> JointScale:
         """The scale as if the rods were where the frame has them."""
-        return calibrate_jointly(
-            self.frame,
-            self._rotations,
-            self._translations,
-            self.spots_px,
-            self.used,
-            self.covariances_px2,
-            self.scale,
-            with_shear,
-        )
+        start = ScaleAndPoses(self.scale, self._rotations, self._translations)
+        return calibrate_jointly(self.frame, self.identified, start, with_shear)
+
+    @property
+    def identified(self) -> IdentifiedSpots:
+        return IdentifiedSpots(self.spots_px, self.used, self.covariances_px2)
 
     def tolerant(self, measured: int = 2) -> TolerantScale:
         """The scale with the rods' tolerances."""
-        start = self.exact_frame(measured == 3)
-        found = calibrate_tolerantly(
-            self.frame,
-            self.tolerances_mm,
-            start.rotations,
-            start.translations,
-            self.spots_px,
-            self.used,
-            self.covariances_px2,
-            start.scale if measured else self.scale,
-            measured,
-        )
+        start = self.exact_frame(measured == 3).at
+        start = start if measured else replace(start, scale=self.scale)
+        found = calibrate_tolerantly(self.frame, self.tolerances_mm, self.identified, start, measured)
         assert found.converged
         return found
 
@@ -355,7 +343,7 @@ class TestToleranceOfTheFrame:
             frame = replace(found.frame, starts=found.frame.starts + ends[0], ends=found.frame.ends + ends[1])
             total = 0.0
             for row, part in enumerate(step[3:21].reshape(3, 6)):
-                pose = Pose(found.rotations[row], found.translations[row]).perturbed(part[:3], part[3:] / 50)
+                pose = Pose(found.at.rotations[row], found.at.translations[row]).perturbed(part[:3], part[3:] / 50)
                 total += float(((project(frame, pose, scale)[0] - series.spots_px[row]) ** 2).sum())
             total /= series.NOISE_PX**2
             for points, true in ((frame.starts, EIGHT_RODS.starts), (frame.ends, EIGHT_RODS.ends)):
@@ -380,7 +368,7 @@ class TestToleranceOfTheFrame:
             ends = tolerances_mm[None, :, None] * step[20:].reshape(2, 8, 3)
             frame = replace(found.frame, starts=found.frame.starts + ends[0], ends=found.frame.ends + ends[1])
             poses = [
-                Pose(found.rotations[row], found.translations[row]).perturbed(part[:3], part[3:])
+                Pose(found.at.rotations[row], found.at.translations[row]).perturbed(part[:3], part[3:])
                 for row, part in enumerate(step[2:20].reshape(3, 6))
             ]
             return np.concatenate([project(frame, pose, scale)[0].ravel() for pose in poses]) / series.NOISE_PX
@@ -467,16 +455,7 @@ class TestSeries:
         if calibrated is Series.exact_frame:
             assert not calibrated(series).converged
             return
-        found = calibrate_tolerantly(
-            series.frame,
-            series.tolerances_mm,
-            start.rotations,
-            start.translations,
-            series.spots_px,
-            series.used,
-            series.covariances_px2,
-            start.scale,
-        )
+        found = calibrate_tolerantly(series.frame, series.tolerances_mm, series.identified, start.at)
         assert not found.converged
 
 

@@ -14,8 +14,9 @@ from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import cut
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.solvers.distance_equations import PAIRS
 from stereoreg_ros.solvers.maximum_likelihood import Refined, refine
-from stereoreg_ros.solvers.three_rods import PAIRS, ThreeLineSolver
+from stereoreg_ros.solvers.three_rods import ThreeRodSolver
 from support.frames import random_frame, random_slice_from_frame
 
 TOLERANCE = 0.3
@@ -42,16 +43,16 @@ class Solved:
 
 def solve(frame: Frame, spots_mm: Array, tolerance: float = TOLERANCE, lines: tuple[int, int, int] = ALL) -> Solved:
     """All poses for triples of spots (t, 3, 2)."""
-    return solved(ThreeLineSolver(frame, lines, tolerance, SLACK), spots_mm)
+    return solved(ThreeRodSolver(frame, lines, tolerance, SLACK), spots_mm)
 
 
 @cache
-def leksell_solver(lines: tuple[int, int, int]) -> ThreeLineSolver:
+def leksell_solver(lines: tuple[int, int, int]) -> ThreeRodSolver:
     """Made once for all slices of the plates: its table takes longer than they do."""
-    return ThreeLineSolver(load_frame("leksell_ct"), lines, 0.95, SLACK)
+    return ThreeRodSolver(load_frame("leksell_ct"), lines, 0.95, SLACK)
 
 
-def solved(solver: ThreeLineSolver, spots_mm: Array) -> Solved:
+def solved(solver: ThreeRodSolver, spots_mm: Array) -> Solved:
     seeds = solver.solve(distances(spots_mm).T, solver.table(0, int(solver.rods_cut.max())))
     poses = solver.poses(seeds.lambdas, spots_mm[seeds.triples])
     return Solved(seeds.triples, seeds.lambdas, seeds.lambda_covariance, *poses)
@@ -231,7 +232,7 @@ class TestNothing:
 
     def test_possible_distances_are_within_the_stated_bounds(self) -> None:
         for frame, _, spots, _ in scenes(11, 20):
-            table = ThreeLineSolver(frame, ALL, TOLERANCE, SLACK).table(0, 3)
+            table = ThreeRodSolver(frame, ALL, TOLERANCE, SLACK).table(0, 3)
             between = distances(spots)
             assert (between >= table.low).all()
             assert (between <= table.high).all()
@@ -248,7 +249,7 @@ class TestCells:
             true = random_slice_from_frame(rng, frame, max_tilt_deg=40.0)
             cuts = cut(frame, true.rotation, true.translation)
             assert cuts.inside.all()
-            solver = ThreeLineSolver(frame, (0, 2, 5), TOLERANCE, SLACK, 0.2)
+            solver = ThreeRodSolver(frame, (0, 2, 5), TOLERANCE, SLACK, 0.2)
             spots = cuts.points_mm[[0, 2, 5]]
             # All six rods are cut, and the slice is not among those that cut fewer.
             seeds = solver.solve(distances(spots)[:, None], solver.table(6, 6))
@@ -262,6 +263,6 @@ class TestCells:
 
     def test_cells_of_leaning_rods_are_in_no_table_of_three(self) -> None:
         frame = random_frame(np.random.default_rng(13), 4)
-        loose, strict = (ThreeLineSolver(frame, ALL, TOLERANCE, SLACK, least) for least in (0.0, 0.9))
+        loose, strict = (ThreeRodSolver(frame, ALL, TOLERANCE, SLACK, least) for least in (0.0, 0.9))
         assert (strict.rods_cut == 0).sum() > (loose.rods_cut == 0).sum()
         assert (strict.rods_cut <= loose.rods_cut).all()

@@ -15,8 +15,9 @@ from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.dicom import DicomSlice, read_series
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.simulation import Cylinder, add_metal
-from stereoreg_ros.spots import FoundSpots, find_spots
+from stereoreg_ros.spots import find_spots
 from stereoreg_ros.spots.choice import worth_matching
 from stereoreg_ros.spots.peaks import find_peaks
 from support.artefacts import measure as measure_scanned
@@ -29,7 +30,7 @@ SCALE = PixelScale(0.5, 0.5)
 SAME_PX = 1.5
 
 
-def found_in(image: Array, options: RegistrationOptions = AUTO, scale: PixelScale = SCALE) -> FoundSpots:
+def found_in(image: Array, options: RegistrationOptions = AUTO, scale: PixelScale = SCALE) -> SliceSpots:
     return find_spots(Slice(image.astype(np.float32), scale), options)
 
 

@@ -9,9 +9,10 @@ import pytest
 
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import PixelScale, Slice
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import RegistrationOptions
 from stereoreg_ros.simulation import Cylinder, add_metal
-from stereoreg_ros.spots import FoundSpots, find_spots
+from stereoreg_ros.spots import find_spots
 from support.artefacts import measure as measure_scanned
 from support.spot_accuracy import CASES, Case, measure
 
@@ -48,7 +49,7 @@ def two_rods(rng: np.random.Generator, apart_mm: float) -> tuple[Array, Array]:
     return np.clip(np.rint(image), -1024, 3071), centres
 
 
-def found_in(image: Array, options: RegistrationOptions) -> FoundSpots:
+def found_in(image: Array, options: RegistrationOptions) -> SliceSpots:
     return find_spots(Slice(image.astype(np.float32), SCALE), options)
 
 

@@ -201,7 +201,7 @@ class TestHostileImages:
             image[rng.integers(0, 24, 30), rng.integers(0, 24, 30)] = value
             found = find_spots(Slice(image.astype(np.float32), PixelScale(1.0, 1.0)), options)
             assert np.isfinite(found.centres_px).all()
-            assert np.isfinite(found.covariances_px2).all()
+            assert np.linalg.eigvalsh(found.covariances_px2).min(initial=0.0) > -1e-9
 
     def test_slopes_in_one_direction_only(self) -> None:
         """The information about such a spot's centre has no inverse, to the last bit where it is large."""

@@ -7,7 +7,7 @@ import pytest
 
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.spots import contrast
-from stereoreg_ros.spots.contrast import _Candidate, _regions, regions_by_contrast
+from stereoreg_ros.spots.contrast import _Candidate, _Prominent, _regions, regions_by_contrast
 from stereoreg_ros.spots.finding import _surroundings
 from stereoreg_ros.spots.peaks import Peaks, find_peaks
 from stereoreg_ros.spots.prominence import Prominence, SmoothSlice, _noise, least_height, prominences
@@ -106,8 +106,8 @@ class TestLikeARod:
         wide = np.where(u**2 + v**2 < 9.5, 95.0, 0.0).astype(np.float32)
         wide[10 + MARGIN, 10 + MARGIN] = 100.0
         assert (wide > 0).sum() == 29
-        peaks, height_hu = peak_at(10, 10, top, rough_height), np.array([height], np.float32)
-        return len(_regions(wide, MARGIN, peaks, 8, height_hu, np.zeros(1), 2.0, most))
+        prominent = _Prominent(peak_at(10, 10, top, rough_height), np.array([height], np.float32), np.zeros(1))
+        return len(_regions(wide, MARGIN, prominent, 8, (2.0, most)))
 
     def test_the_top_of_something_larger_is_none(self) -> None:
         """Down to half of 32 HU it has 29 pixels, which are many where 100 are the most."""

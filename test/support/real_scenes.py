@@ -6,7 +6,7 @@ Each scene says where the frame truly is: by all slices of its series together, 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
@@ -15,15 +15,17 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice, register_spots
+from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_slice
 from stereoreg_ros.dicom import read_series
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, nearest_rotation, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.slice import Slice
+from stereoreg_ros.geometry.spots import SliceSpots
+from stereoreg_ros.registration import register_slice_spots
 from stereoreg_ros.result import Refusal, Registration
 from stereoreg_ros.simulation import Cylinder, PlacedFrame, ScannerSettings, render_slice
-from stereoreg_ros.spots import FoundSpots, find_spots
+from stereoreg_ros.spots import find_spots
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 SHARED_DATA: Final = ROOT.parent / "shared" / "data"
@@ -113,25 +115,8 @@ def height_mm(ct_slice: Slice) -> float:
     return float(ct_slice.scanner_from_slice.translation[2])
 
 
-def register_found(
-    found: FoundSpots, ct_slice: Slice, frame: Frame, options: RegistrationOptions, previous: Pose | None = None
-) -> Registration | Refusal:
-    """As `register_slice` does with the spots that it finds, where options give no slice thickness."""
-    scale = ct_slice.scale
-    return register_spots(
-        found.centres_px,
-        frame,
-        scale,
-        options,
-        scanner_from_slice=ct_slice.scanner_from_slice,
-        slice_area_mm2=ct_slice.hu.size * scale.sx * scale.sy,
-        previous=previous,
-        covariances_px2=found.covariances_px2,
-    )
-
-
 @lru_cache(maxsize=1024)
-def _spots_of(ct_slice: Slice, options: RegistrationOptions) -> FoundSpots:
+def _spots_of(ct_slice: Slice, options: RegistrationOptions) -> SliceSpots:
     return find_spots(ct_slice, options)
 
 
@@ -165,7 +150,7 @@ def leksell_changes(frame: Frame) -> dict[str, list[Change]]:
     }
 
 
-def changed(found: FoundSpots, ct_slice: Slice, frame: Frame, change: Change, rng: np.random.Generator) -> FoundSpots:
+def changed(found: SliceSpots, ct_slice: Slice, frame: Frame, change: Change, rng: np.random.Generator) -> SliceSpots:
     """Spots of a Leksell slice without those of the given rods, and with false ones, uniform over the image."""
     slice_from_frame = ct_slice.scanner_from_slice.inverse() @ LEKSELL_POSE
     lines = [frame.line_names.index(name) for name in change.rods]
@@ -179,10 +164,14 @@ def changed(found: FoundSpots, ct_slice: Slice, frame: Frame, change: Change, rn
     rows, columns = ct_slice.hu.shape
     places = rng.uniform(-0.5, np.array([columns, rows]) - 0.5, (change.false_spots, 2))
     false = replace(false, centres_px=places)
-    parts = {
-        entry.name: np.concatenate([getattr(found, entry.name), getattr(false, entry.name)]) for entry in fields(found)
-    }
-    return FoundSpots(**parts)
+    both = found, false
+    return replace(
+        found,
+        centres_px=np.concatenate([one.centres_px for one in both]),
+        covariances_px2=np.concatenate([one.covariances_px2 for one in both]),
+        extents_px2=np.concatenate([one.extents_px2 for one in both]),
+        cut_short=np.concatenate([one.cut_short for one in both]),
+    )
 
 
 def leksell_scenes(folder: Path, options: RegistrationOptions, row: str, seed: int) -> Iterator[Scene]:
@@ -210,7 +199,7 @@ def _register_changed(
     ct_slice: Slice, frame: Frame, options: RegistrationOptions, change: Change, key: Sequence[int]
 ) -> Registration | Refusal:
     found = changed(_spots_of(ct_slice, options), ct_slice, frame, change, np.random.default_rng(key))
-    return register_found(found, ct_slice, frame, options)
+    return register_slice_spots(found, frame, options)
 
 
 # Frames at rest: the truth is what most of the slices say

@@ -14,6 +14,7 @@ from stereoreg_ros.nodes.common import conversions
 from stereoreg_ros.nodes.common.qos import LATCHED, QUEUE, publisher_of
 from stereoreg_ros.nodes.common.transforms import transform_of
 from stereoreg_ros.nodes.register.targets import Accepted, TargetInFrame
+from stereoreg_ros.registration import Registrar
 from stereoreg_ros.result import Refusal, Registration
 
 
@@ -35,10 +36,12 @@ class FrameTopics:
 
 
 class FrameOutput:
-    """A frame, the frame_id of its axes, its topics, and its latest pose where its last slice was accepted."""
+    """A frame, what registers it, the frame_id of its axes, its topics, and its latest pose if its last slice was
+    accepted."""
 
     def __init__(self, frame: Frame, topics: FrameTopics, axes: str) -> None:
         self.frame, self.topics, self.axes = frame, topics, axes
+        self.registrar = Registrar(frame)
         self.latest: Accepted | None = None
 
     def publish(

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import Final
 
-from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal, Sighting, calibrate
+from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal, calibrate
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 
 # Longest search for the scale, seconds; without it slices full of false spots would be searched for minutes.
@@ -35,9 +36,9 @@ class Recalibration:
         self._attempt: Future[Calibration | CalibrationRefusal] | None = None
         self._refusal = CalibrationRefusal("no slice has been accepted yet, nothing to calibrate from")
         # Held, so that a later slice cannot be mistaken for one of these.
-        self._tried: tuple[Sighting, ...] = ()
+        self._tried: tuple[SliceSpots, ...] = ()
 
-    def poll(self, sightings: Sequence[Sighting], now_s: float) -> Calibration | CalibrationRefusal | None:
+    def poll(self, sightings: Sequence[SliceSpots], now_s: float) -> Calibration | CalibrationRefusal | None:
         """The outcome, or None where it is not there yet. sightings: the last slices; now_s: monotonic time."""
         if self._attempt is not None:
             if not self._attempt.done():
@@ -59,7 +60,7 @@ class Recalibration:
         """Have a measurement that goes on end early; nobody waits for it."""
         self._closed = True
 
-    def _measure(self, sightings: Sequence[Sighting], attempt: Future[Calibration | CalibrationRefusal]) -> None:
+    def _measure(self, sightings: Sequence[SliceSpots], attempt: Future[Calibration | CalibrationRefusal]) -> None:
         give_up_s = time.monotonic() + SEARCH_S
 
         def go_on(_share: float) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from typing import Final
@@ -18,7 +19,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
-from stereoreg_ros.calibration.calibrate import sighting_of
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale
 from stereoreg_ros.nodes.common.diagnostic_status import name_of_status
@@ -40,7 +40,6 @@ from stereoreg_ros.nodes.register.slice_status import status_of, status_of_unusa
 from stereoreg_ros.nodes.register.stream_status import StreamCounts, StreamStatus
 from stereoreg_ros.nodes.register.target_keeper import TargetKeeper
 from stereoreg_ros.nodes.register.worker import Worker
-from stereoreg_ros.registration import preparation
 
 _REPORT_STREAM_S: Final = 1.0
 _REPEAT_WARNING_S: Final = 5.0
@@ -133,7 +132,7 @@ class RegisterNode(Node):
         latest = [output.latest for output in self._outputs]
         setup = SliceSetup(
             self.settings,
-            tuple(output.frame for output in self._outputs),
+            tuple(output.registrar for output in self._outputs),
             tuple(one.registration.scanner_from_frame if one else None for one in latest),
             scale,
         )
@@ -196,8 +195,7 @@ class RegisterNode(Node):
         header = Header(stamp=incoming.stamp, frame_id=self._axes_of(incoming))
         ct_slice, results = registered.ct_slice, registered.results
         if len(results[0].spots_px) >= self.settings.options.min_inliers:
-            plane, stated = ct_slice.scanner_from_slice, incoming.spacing
-            self._scale.add(sighting_of(results[0], ct_slice.hu.size, plane, stated), stated)
+            self._scale.add(replace(results[0].spots, stated_scale=incoming.spacing))
         for output, result in zip(self._outputs, results, strict=True):
             output.publish(result, header, incoming.received_s, self._send_transform)
         statuses = [status_of(result, scale.source, registered.duration_s, header.frame_id) for result in results]
@@ -305,8 +303,8 @@ class RegisterNode(Node):
     def _prepare_tables(self, scale: PixelScale) -> None:
         """Begin anew with the tables that slices of this scale would wait for."""
         self._prepared_for, options = scale, self.settings.options
-        frames = [output.frame for output in self._outputs]
-        self._preparation = chain.from_iterable(preparation(frame, scale, options) for frame in frames)
+        registrars = [output.registrar for output in self._outputs]
+        self._preparation = chain.from_iterable(one.preparation(scale, options) for one in registrars)
 
     def _on_prepared(self, tables: Iterator[None], done: bool) -> None:
         if done and tables is self._preparation:

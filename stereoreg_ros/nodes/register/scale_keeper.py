@@ -11,7 +11,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from stereoreg_ros.calibration.calibrate import Calibration, Sighting
+from stereoreg_ros.calibration.calibrate import Calibration
 from stereoreg_ros.calibration.file import (
     CalibrationFileError,
     CalibrationRecord,
@@ -22,6 +22,7 @@ from stereoreg_ros.calibration.file import (
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
 from stereoreg_ros.geometry.slice import PixelScale
+from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.nodes.register.parameters import NodeSettings
 
 
@@ -52,7 +53,7 @@ class ScaleKeeper:
     """
 
     def __init__(self, node: Node, registering: _Registering) -> None:
-        self.sightings: deque[Sighting] = deque(maxlen=registering.settings.calibration.calibration_slices)
+        self.sightings: deque[SliceSpots] = deque(maxlen=registering.settings.calibration.calibration_slices)
         self._node, self._registering = node, registering
         self._configured = registering.settings.scale
         self._record: CalibrationRecord | None = None
@@ -84,12 +85,12 @@ class ScaleKeeper:
         """The scale of the sightings, or of the slices to come, which a measured one would replace."""
         return self.scale_for(self._stated)
 
-    def add(self, sighting: Sighting, stated: PixelScale | None) -> None:
+    def add(self, spots: SliceSpots) -> None:
         """Take a slice to measure from; slices of another scale say nothing about this one's."""
-        if stated != self._stated:
+        if spots.stated_scale != self._stated:
             self.sightings.clear()
-            self._stated = stated
-        self.sightings.append(sighting)
+            self._stated = spots.stated_scale
+        self.sightings.append(spots)
 
     def keep_slices(self, count: int) -> None:
         """Keep the last `count` slices to measure from."""

@@ -6,14 +6,13 @@ import time
 import traceback
 from dataclasses import dataclass
 
-from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.slice import Slice
 from stereoreg_ros.nodes.common.conversions import hu_from_image
 from stereoreg_ros.nodes.register.incoming_slice import IncomingSlice
 from stereoreg_ros.nodes.register.parameters import NodeSettings
 from stereoreg_ros.nodes.register.scale_keeper import ScaleInUse
-from stereoreg_ros.registration import register_frames
+from stereoreg_ros.registration import Registrar, register_frames
 from stereoreg_ros.result import Reason, Refusal, Registration
 
 
@@ -25,7 +24,7 @@ class SliceSetup:
     """
 
     settings: NodeSettings
-    frames: tuple[Frame, ...]
+    registrars: tuple[Registrar, ...]
     previous: tuple[Pose | None, ...]
     scale: ScaleInUse
 
@@ -57,7 +56,7 @@ def register_incoming(incoming: IncomingSlice, setup: SliceSetup) -> Registered 
         hu = hu_from_image(incoming.image, settings.rescale_slope, settings.rescale_intercept)
         scanner_from_slice = Pose.identity() if plane is None else plane.scanner_from_slice
         ct_slice = Slice(hu, setup.scale.scale, scanner_from_slice)
-        results = register_frames(ct_slice, setup.frames, settings.options, setup.previous, setup.scale.covariance)
+        results = register_frames(ct_slice, setup.registrars, settings.options, setup.previous, setup.scale.covariance)
     except ValueError as error:
         return Unusable("bad_image", str(error), time.perf_counter() - started_s)
     except Exception as error:
