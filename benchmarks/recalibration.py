@@ -42,7 +42,7 @@ class Kind(NamedTuple):
     stated: bool = False
 
 
-def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelScale) -> list[Sighting]:
+def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, stated: PixelScale) -> list[Sighting]:
     """Spots found in rendered slices of a frame, their centres shifted by CENTRE_NOISE_PX."""
     taken = []
     for _ in range(kind.slices):
@@ -50,7 +50,7 @@ def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelSca
         ct_slice: Slice = render_slice([PlacedFrame(frame, random_pose(rng, frame, scanner))], scanner, rng)
         seen = sighting_of(register_slice(ct_slice, frame), ct_slice.hu.size)
         shifted = seen.spots_px + CENTRE_NOISE_PX * rng.standard_normal(seen.spots_px.shape)
-        taken.append(Sighting(shifted, seen.covariances_px2, seen.pixels, stated=told if kind.stated else None))
+        taken.append(Sighting(shifted, seen.covariances_px2, seen.pixels, stated=stated if kind.stated else None))
     return taken
 
 
@@ -97,10 +97,10 @@ def main() -> int:
             by = 1 + (
                 rng.choice([-kind.wrong, kind.wrong], 2) if trial % 2 else rng.uniform(-kind.wrong, kind.wrong, 2)
             )
-            told = PixelScale(by[0] * TRUE.sx, by[1] * TRUE.sy)
-            taken = sightings(rng, as_built(rng, frame, kind), kind, told)
+            assumed = PixelScale(by[0] * TRUE.sx, by[1] * TRUE.sy)
+            taken = sightings(rng, as_built(rng, frame, kind), kind, assumed)
             start = time.perf_counter()
-            found = calibrate(taken, frame, told, options)
+            found = calibrate(taken, frame, assumed, options)
             times.append(time.perf_counter() - start)
             if not isinstance(found, Calibration):
                 reasons[found.message[:60]] += 1
