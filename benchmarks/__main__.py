@@ -1,4 +1,4 @@
-"""`make bench`: times as multiples of the yardstick Y, how good the spots are, and how often the answer is right."""
+"""`make bench`: times as multiples of the yardstick Y, accuracy of the spots, and how often the pose is right."""
 
 from __future__ import annotations
 

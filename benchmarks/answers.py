@@ -1,4 +1,4 @@
-"""What is heard of register_node about every slice, and when."""
+"""The answers of register_node to every slice, and when they arrived."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DEEP: Final = QoSProfile(depth=1000)
 
 @dataclass
 class Answers:
-    """When the answers to each stamp arrived, ns; how long the node says it took, s; and which were refused why."""
+    """When the answers to each stamp arrived, ns; the duration that the node states, s; and the reasons of refusals."""
 
     poses: dict[int, int] = field(default_factory=dict)
     statuses: dict[int, int] = field(default_factory=dict)
@@ -43,7 +43,7 @@ class Listener(Node):
         return self.count_publishers("pose") > 0 and self.count_publishers("/diagnostics") > 0
 
     def spin(self, until: Callable[[], bool], seconds: float) -> bool:
-        """Listen until something is so; False where it was not within so many seconds."""
+        """Listen until a condition holds; False where it did not within the time limit."""
         deadline = time.monotonic() + seconds
         while not until():
             if time.monotonic() > deadline:
@@ -52,11 +52,11 @@ class Listener(Node):
         return True
 
     def on_pose(self, message: PoseStamped) -> None:
-        """A pose has come."""
+        """Note a pose."""
         self.heard.poses[nanoseconds(message)] = time.time_ns()
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Statuses have come, of a slice or of something else."""
+        """Note statuses, of a slice or of something else."""
         for status in message.status:
             if status.name == name_of_status("register_node", NAME):
                 stamp = nanoseconds(message)

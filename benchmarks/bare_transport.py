@@ -1,4 +1,4 @@
-"""How long an image of the stream takes to a subscriber that does nothing else: the machine's and DDS's own part."""
+"""How long an image of the stream takes to reach a subscriber that does nothing else: the share of machine and DDS."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from benchmarks.slice_source import WARM_UP
 
 
 def bare_transport_s(rate: float, slices: int) -> float:
-    """Median time from an image's stamp to its arrival, s, of so many slices at a rate in Hz; rclpy is initialised."""
+    """Median time from an image's stamp to its arrival, s, of `slices` slices at a rate in Hz; rclpy is initialised."""
     node = Node("bare_subscriber")
     latencies: list[float] = []
     node.create_subscription(

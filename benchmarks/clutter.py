@@ -1,4 +1,4 @@
-"""`python -m benchmarks.clutter`: spots that are all false. How many are taken for a frame, and how many might be.
+"""`python -m benchmarks.clutter`: spots that are all false. How often are they taken for a frame?
 
 The theory (docs/matching.md) says how many matches chance brings at most at each threshold. Here spots are drawn
 uniformly, and what is found is counted.

@@ -30,7 +30,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=100, help="kills (default 100)")
     parser.add_argument("--seed", type=int, default=1, help="seed of slices, victims and moments (default 1)")
     arguments = parser.parse_args()
-    # The scanner finds nobody at the port each time that the receiver is killed.
+    # Each time that the receiver is killed, the scanner finds the port closed.
     logging.getLogger("pynetdicom").setLevel(logging.CRITICAL)
     begun_s = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, RosClient("controller") as client:

@@ -42,7 +42,7 @@ class Problem:
     max_rotation_deg: float = 180.0
     guess: tuple[float, float] | None = None
     any_rotation: bool = False
-    trials: float = 1.0  # share of the trials asked for
+    trials: float = 1.0  # share of the requested trials
 
 
 PROBLEMS = (
@@ -70,7 +70,7 @@ PROBLEMS = (
 
 @dataclass(frozen=True)
 class Row:
-    """What a class of problems gave; times in seconds.
+    """The results of a class of problems; times in seconds.
 
     unit_s: the yardstick meanwhile, once after each problem.
     weak: accepted, and off by more than WRONG_MM or WRONG_DEG, but as the stated covariance says.
@@ -100,7 +100,7 @@ def measure(problem: Problem, trials: int) -> Row:
     # The Leksell box is wider than the others.
     scanner = ScannerSettings(shape=(640, 640)) if problem.frame == "leksell_ct" else ScannerSettings()
     settings = SpotSetSettings(scanner, problem.visible, problem.false_spots, problem.noise_px)
-    # The simulated frames are as their files have them, and weak poses are counted as such.
+    # The simulated frames match their files exactly, and weak poses are counted as such.
     options = RegistrationOptions(
         spot_noise_px=max(settings.noise_std_px, 0.01),
         frame_tolerance_mm=0.0,
@@ -142,7 +142,7 @@ def measure(problem: Problem, trials: int) -> Row:
 def _drawn(
     rng: np.random.Generator, frame: Frame, settings: SpotSetSettings, problem: Problem, count: int
 ) -> Iterator[SpotSet]:
-    """So many problems, their poses within the prior."""
+    """`count` problems, their poses within the prior."""
     while count:
         nominal = None
         if problem.any_rotation:

@@ -17,7 +17,7 @@ What no single slice can show, whatever the software:
   three spots say where the plate is, and only the third at what height it is cut; read the wrong way round, it is
   another height, which some other plane satisfies but for the foreshortening of the plates. `leksell_ct9` with the
   front diagonal mirrored is exactly what the true one is upside down: without a prior every slice fits that.
-- Errors of spacing and of rods' ends leave 2 n - 6 figures to tell them by. Five rods leave four: some errors are then
+- Errors of spacing and of rods' ends leave 2 n - 6 figures that show them. Five rods leave four: some errors are then
   nearly those of another pose.
 The first two are kinds. Of the others it depends on the scene, which is what `fits` says.
 """
@@ -42,7 +42,7 @@ _BATCH = 50
 
 
 def measured_rows(kinds: list[str], frames: list[str], scenes: int, seed: int, workers: int) -> Iterator[Row]:
-    """A row for each kind and frame; the same, times apart, whatever the number of workers."""
+    """A row for each kind and frame; except for times, independent of the number of workers."""
     cells = [(kind, frame) for frame in frames for kind in kinds]
     starts = range(0, scenes, _BATCH)
     with (
@@ -80,7 +80,7 @@ def _line(row: Row) -> str:
 
 
 def _describe(kind: str, frame: str, index: int, seed: int) -> None:
-    """One scene: what is true, and what came of it."""
+    """One scene: the truth and the result."""
     scene = scene_of(kind, frame, index, seed)
     result = register(scene)
     print(f"{len(scene.spots_px)} spots, rods {scene.rods.tolist()}, options {scene.options}, scale {scene.scale}")

@@ -46,7 +46,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.real_frames", description=__doc__)
     parser.add_argument("rows", nargs="*", help="parts of the names of the rows wanted (default: all)")
     parser.add_argument("--quick", action="store_true", help="a few scenes of the most telling rows, in a minute")
-    parser.add_argument("--scenes", type=int, help="at most so many scenes of each row (default: all)")
+    parser.add_argument("--scenes", type=int, help="most scenes of each row (default: all)")
     parser.add_argument("--seed", type=int, default=0, help="of false spots and rendered poses (default 0)")
     parser.add_argument("--list", action="store_true", help="the rows' names")
     parser.add_argument("--details", action="store_true", help="every scene of the rows")

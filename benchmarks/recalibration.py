@@ -44,7 +44,7 @@ class Kind(NamedTuple):
     stated: bool = False
 
 
-def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelScale) -> list[SliceSpots]:
+def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, stated: PixelScale) -> list[SliceSpots]:
     """Spots found in rendered slices of a frame, their centres shifted by CENTRE_NOISE_PX."""
     taken = []
     for _ in range(kind.slices):
@@ -52,7 +52,7 @@ def sightings(rng: np.random.Generator, frame: Frame, kind: Kind, told: PixelSca
         ct_slice: Slice = render_slice([PlacedFrame(frame, random_pose(rng, frame, scanner))], scanner, rng)
         found = find_spots(ct_slice, RegistrationOptions())
         shifted = found.centres_px + CENTRE_NOISE_PX * rng.standard_normal(found.centres_px.shape)
-        taken.append(replace(found, centres_px=shifted, stated_scale=told if kind.stated else None))
+        taken.append(replace(found, centres_px=shifted, stated_scale=stated if kind.stated else None))
     return taken
 
 
@@ -99,10 +99,10 @@ def main() -> int:
             by = 1 + (
                 rng.choice([-kind.wrong, kind.wrong], 2) if trial % 2 else rng.uniform(-kind.wrong, kind.wrong, 2)
             )
-            told = PixelScale(by[0] * TRUE.sx, by[1] * TRUE.sy)
-            taken = sightings(rng, as_built(rng, frame, kind), kind, told)
+            assumed = PixelScale(by[0] * TRUE.sx, by[1] * TRUE.sy)
+            taken = sightings(rng, as_built(rng, frame, kind), kind, assumed)
             start = time.perf_counter()
-            found = calibrate(taken, frame, told, options)
+            found = calibrate(taken, frame, assumed, options)
             times.append(time.perf_counter() - start)
             if not isinstance(found, Calibration):
                 reasons[found.message[:60]] += 1

@@ -1,4 +1,4 @@
-"""register_node as a process of its own, and what it takes of the machine."""
+"""register_node as a process of its own, and its load on the machine."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class RegisterProcess:
         return self._popen.poll() is None
 
     def end(self) -> None:
-        """By SIGINT, or where that does not help by SIGKILL."""
+        """End it by SIGINT, or if that does not help by SIGKILL."""
         self._popen.send_signal(signal.SIGINT)
         try:
             self._popen.wait(timeout=10)
@@ -63,14 +63,14 @@ class RegisterProcess:
 
 @dataclass(frozen=True)
 class Load:
-    """What the node took of the machine over some time: CPU in % of a core, and its largest resident memory in MiB."""
+    """The node's load over some time: CPU in % of a core, and its largest resident memory in MiB."""
 
     cpu_percent: float
     memory_mib: float
 
 
 class LoadMeter:
-    """The load of a process from now on."""
+    """Measures the load of a process from now on."""
 
     def __init__(self, process: psutil.Process) -> None:
         self._process = process
@@ -78,7 +78,7 @@ class LoadMeter:
         self._largest = 0
 
     def load(self) -> Load:
-        """Until now; memory is the most that was seen at any call."""
+        """The load until now; memory is the largest at any call."""
         self._largest = max(self._largest, self._process.memory_info().rss)
         used, begun = self._start
         return Load(100 * (self._used() - used) / (time.monotonic() - begun), self._largest / _MIB)

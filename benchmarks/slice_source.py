@@ -27,11 +27,11 @@ from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_message
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, passage, random_pose, render_slice
 
-# Discovery is not what is measured: the first slices are for finding each other.
+# Discovery is not part of the measurement: the first slices give it time.
 WARM_UP: Final = 20
 FRAME: Final = "cube6"
 SCANNER: Final = ScannerSettings(false_spots=24)
-# Kept for whoever comes late: to judge a slice one needs its truth.
+# Kept for late subscribers: to judge a slice they need its truth.
 TRUTH_QOS: Final = QoSProfile(
     depth=1000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -45,7 +45,7 @@ _DEADLINE_S: Final = 30.0
 
 @dataclass(frozen=True)
 class Drawn:
-    """An image, and where the frame stands in it; None where there is none."""
+    """An image, and where the frame stands in it; None where no frame is shown."""
 
     image: Image
     scanner_from_frame: Pose | None
@@ -68,7 +68,7 @@ def main() -> int:
     deadline = time.monotonic() + _DEADLINE_S
     while publisher.get_subscription_count() == 0:
         if time.monotonic() > deadline:
-            print(f"nobody subscribed to image within {_DEADLINE_S:g} s", file=sys.stderr)
+            print(f"no subscriber of image within {_DEADLINE_S:g} s", file=sys.stderr)
             return 1
         rclpy.spin_once(node, timeout_sec=0.05)
     stamps = []

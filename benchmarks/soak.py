@@ -1,4 +1,4 @@
-"""`python -m benchmarks.soak`, `make soak`: slices at a steady rate for as long as told; what is lost, what grows?
+"""`python -m benchmarks.soak`, `make soak`: slices at a steady rate for a given time; what is lost, what grows?
 
 Scanner, node and listener are processes. Six rods and 24 false spots move through 512 x 512 pixels, now and then a
 slice shows no frame. Memory is what register_node holds that no file holds too, be it swapped out. Latency is from an
@@ -66,7 +66,7 @@ class Counts:
 
 
 class _SoakListener(Listener):
-    """Hears the truth too."""
+    """Collects the truth too."""
 
     def __init__(self) -> None:
         super().__init__("soak_listener")
@@ -114,7 +114,7 @@ def _soak(listener: _SoakListener, node: RegisterProcess, rate: float, slices: i
     command = [sys.executable, "-m", "benchmarks.slice_source", "--rate", str(rate), "--slices", str(slices)]
     command += ["--passages", str(_PASSAGES)]
     yardstick, samples, heard = Yardstick(), list[Sample](), listener.heard
-    # To a file: a pipe that nobody reads would hold up the source's last words.
+    # To a file: a pipe that is not read would block the source's last lines.
     with tempfile.TemporaryFile("w+") as said, subprocess.Popen(command, stdout=said) as source:
         try:
             # Until the slices begin, the source is drawing them.
@@ -173,7 +173,7 @@ def _print_verdict(windows: list[Window], verdict: Verdict) -> None:
 
 
 def main() -> int:
-    """Print the figures, write them as JSON and as a picture; 1 where one is not what it has to be."""
+    """Print the figures, write them as JSON and as a picture; 1 where one misses its target."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.soak", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -184,7 +184,7 @@ def main() -> int:
     slices = round(60 * arguments.minutes * arguments.rate)
     if arguments.rate <= 0 or slices < 15 * arguments.rate:
         parser.error(f"--minutes is {arguments.minutes:g}, --rate {arguments.rate:g}, expected 0.25 or more, above 0")
-    # Nobody else is heard or disturbed.
+    # Other nodes on the network neither disturb nor are disturbed.
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     rclpy.init()
@@ -220,7 +220,7 @@ def main() -> int:
         "samples": [asdict(sample) for sample in samples],
     }
     (arguments.output / "soak.json").write_text(json.dumps(record, indent=1) + "\n")
-    # Only here: the figures are there where matplotlib is not.
+    # Imported only here: the figures do not need matplotlib.
     from benchmarks.soak_plot import draw_soak
 
     draw_soak(samples, windows, verdict, arguments.output / "soak.png")

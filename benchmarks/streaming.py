@@ -126,7 +126,7 @@ def _print(stream: Stream, unit: float) -> None:
 
 
 def main() -> int:
-    """Print the figures, write them as JSON; 1 where one is not what it has to be."""
+    """Print the figures, write them as JSON; 1 where one misses its target."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.streaming", description=__doc__)
     parser.add_argument("--slices", type=int, default=1000, help="slices at each rate (default 1000)")
     parser.add_argument(
@@ -136,7 +136,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.slices < 8:
         parser.error(f"--slices is {arguments.slices}, expected 8 or more")
-    # Nobody else is heard or disturbed.
+    # Other nodes on the network neither disturb nor are disturbed.
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     yardstick = Yardstick()

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.uncertainty`: are poses as far off as they say?
+"""`python -m benchmarks.uncertainty`: are the errors of poses as large as stated?
 
 Spot sets and rendered slices with known poses are registered, and the errors compared with the stated covariances: the
 mean of the squared errors in terms of the covariance (NEES, 6 where it is right) and how often the 95 % ball at targets

@@ -30,9 +30,9 @@ class Yardstick:
         self._hu = render_slice([PlacedFrame(frame, random_pose(rng, frame, settings))], settings, rng).hu
 
     def once(self) -> float:
-        """Seconds that it takes now: other work on the machine makes it vary."""
+        """Seconds that it takes at present; other work on the machine makes it vary."""
         return seconds_of(lambda: cv2.connectedComponentsWithStats((self._hu > 2000).view(np.uint8), connectivity=8))
 
     def unit(self, repeats: int = 200) -> float:
-        """The median of so many, s."""
+        """The median of several, s."""
         return median(self.once() for _ in range(repeats))

@@ -1,1 +1,1 @@
-"""Hostile input by machine: `python -m fuzzing`; docs/fuzzing.md says what for."""
+"""Hostile input made by machine: `python -m fuzzing`; see docs/fuzzing.md."""

@@ -15,7 +15,7 @@ from fuzzing.watch import Report, run
 
 
 def main() -> int:
-    """Print a table of what was tried; 1 where anything was found, which then lies in the corpus."""
+    """Print a table of what was tried; 1 where anything was found, which is then added to the corpus."""
     parser = argparse.ArgumentParser(prog="python -m fuzzing", description=__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}; all by default")
     parser.add_argument("--inputs", type=int, default=10_000, help="inputs of each kind (default 10000)")
@@ -39,9 +39,9 @@ def main() -> int:
 
 
 def _to_corpus(name: str, folder: Path) -> None:
-    """Lay findings where the tests try them again."""
-    for told in folder.glob("*.txt"):
-        found = told.with_suffix(KINDS[name].ending)
+    """Copy findings to where the tests try them again."""
+    for note in folder.glob("*.txt"):
+        found = note.with_suffix(KINDS[name].ending)
         (CORPUS / name).mkdir(parents=True, exist_ok=True)
         shutil.copy(found, CORPUS / name)
 

@@ -20,16 +20,16 @@ from fuzzing.kind import Kind
 from fuzzing.outcome import HANG_S, WAIT_S, bound_memory, outcome_of, peak_memory_bytes
 
 HAS_ATHERIS: Final = importlib.util.find_spec("atheris") is not None
-# Of one fault so many inputs are kept.
+# Inputs that are kept of one fault.
 _KEPT: Final = 2
 # An exit status of its own: the last input made the process too large.
 OUT_OF_MEMORY: Final = 87
 _HANGS: Final = 88
-# Of the inputs that the engine of atheris asks for, so many are changed by what knows the kind, the others by its own.
+# Share of atheris' inputs that are mutated by the kind's own function; the others by its engine.
 _KNOWING: Final = 0.7
-# And so many begin again with an input that was there at the start: what reaches new branches drifts away from sense.
+# Share that start again from an initial input: those that reach new branches drift into nonsense.
 _AFRESH: Final = 0.6
-# Numbers go through these; to count their branches would only make them slow.
+# Numerical code; to count its branches would only slow it down.
 _UNCOUNTED: Final = ["stereoreg_ros.matching", "stereoreg_ros.solvers", "stereoreg_ros.simulation"]
 # Longer ones are tried, but not changed again and again: they take long. Valid ones may be of any length.
 _LONGEST_CHANGED: Final = 4096
@@ -116,7 +116,7 @@ def _run_atheris(attempts: _Attempts, kind: Kind, inputs: int, seed: int, folder
 
     options = [
         *(f"-runs={inputs}", f"-seed={seed % 2**31 + 1}", "-max_len=90000", "-len_control=0", "-print_final_stats=0"),
-        # The watcher sees to hangs and memory.
+        # Hangs and memory are the watcher's task.
         *("-timeout=100000", "-rss_limit_mb=0", "-malloc_limit_mb=0", "-verbosity=0", f"-artifact_prefix={folder}/"),
         *(f"-handle_{signal}=0" for signal in _SIGNALS),
     ]
@@ -135,7 +135,7 @@ def _hangs(kind: Kind, data: bytes) -> bool:
 
 
 def main() -> int:
-    """Entry point: try `inputs` inputs; or, with --again, one input alone, and tell whether it really hangs."""
+    """Entry point: try `inputs` inputs; or, with --again, one input alone, to see whether it really hangs."""
     parser = argparse.ArgumentParser(prog="python -m fuzzing.attempts", description=__doc__)
     parser.add_argument("kinds", help="module with KINDS")
     parser.add_argument("kind")

@@ -100,7 +100,7 @@ def mutate_dicom(data: bytes, rng: random.Random) -> bytes:
     body = b"".join(map(bytes, elements))
     if syntax == _DEFLATED:
         deflater = zlib.compressobj(wbits=-zlib.MAX_WBITS)
-        # At times with more behind it than anybody wants to have.
+        # Sometimes with extra data behind it.
         body = deflater.compress(body + bytes(2**22 if rng.random() < 0.02 else 0)) + deflater.flush()
     inner = b"".join(map(bytes, meta[1:]))
     if meta and meta[0].tag == _GROUP_LENGTH and meta[0].length is None and len(meta[0].value) == 4:

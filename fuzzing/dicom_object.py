@@ -19,7 +19,7 @@ from stereoreg_ros.reception.slice_queue import SliceQueue
 # Sixty times the seeds.
 _MOST_BYTES: Final = 2**18
 _MOST_FRAMES: Final = 8
-# So many are received only for each one that is read as a file as well.
+# One in this many is read as a file as well.
 _READ_ONCE_IN: Final = 4
 
 

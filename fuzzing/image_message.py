@@ -24,7 +24,7 @@ from stereoreg_ros.registration import prepare, register_frames
 from stereoreg_ros.result import REASONS
 from stereoreg_ros.simulation import PlacedFrame, ScannerSettings, random_pose, render_slice
 
-# So many are converted only for each one that is registered as well, which takes a hundred times as long.
+# One in this many is registered as well, which takes a hundred times as long.
 _REGISTERED_ONCE_IN: Final = 200
 _LARGEST_REGISTERED: Final = 96 * 96
 # What the node's parameters may be; the message's stamp chooses, so that the message is all there is to an input.

@@ -7,7 +7,7 @@ import re
 from typing import Final
 
 _LONGEST: Final = 8192
-# Once in so many inputs it may be longer, up to a limit beyond those of the readers.
+# One in this many inputs may be longer, up to a limit beyond those of the readers.
 _LONG_ONCE_IN: Final = 400
 _LONGEST_OF_ALL: Final = 80_000
 

@@ -46,7 +46,7 @@ def outcome_of(kind: Kind, data: bytes) -> Outcome:
 
 
 def bound_memory(more_bytes: int) -> None:
-    """No allocation of this process beyond so much more than it has now; what asks for it gets an error."""
+    """Limit how much more memory this process may allocate; beyond it, an allocation fails with an error."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     bound = pages * resource.getpagesize() + more_bytes
     resource.setrlimit(resource.RLIMIT_AS, (bound, bound))

@@ -65,7 +65,7 @@ class _ReasonError(ValueError):
 
 @functools.cache
 def _pipe() -> str:
-    """Who opens it to read would wait for somebody who writes."""
+    """Opening it to read would wait for a writer."""
     path = Path(tempfile.mkdtemp(prefix="fuzzing-")) / "pipe.yaml"
     os.mkfifo(path)
     return str(path)

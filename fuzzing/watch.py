@@ -23,7 +23,7 @@ from fuzzing.kind import Kind
 from fuzzing.outcome import HANG_S, WAIT_S
 
 _POLL_S: Final = 0.02
-# To start Python, ROS and all that, on a busy machine.
+# To start Python and ROS on a busy machine.
 _START_S: Final = 120.0
 # An input that is tried three times again may take so long; then it hangs for good.
 _AGAIN_S: Final = 3 * WAIT_S
@@ -41,7 +41,7 @@ class Report:
 
 
 def run(kind: Kind, inputs: int, seed: int, folder: Path, kinds: str = "fuzzing.kinds") -> Report:
-    """Try so many inputs; findings lie in `folder` then, with what went wrong beside each.
+    """Try inputs; findings then lie in `folder`, with what went wrong beside each.
 
     kinds: the module in whose KINDS the process finds the kind.
     """

@@ -28,7 +28,7 @@ _MOST_ROWS = 4096
 _LINE = 26
 _MARGIN = 12
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
-# Residuals are drawn so many times longer than they are: in a good registration they are a fraction of a pixel.
+# Residuals are drawn this many times longer: in a good registration they are a fraction of a pixel.
 _RESIDUAL_MAGNIFICATION = 10
 
 

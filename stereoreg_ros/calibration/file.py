@@ -1,4 +1,4 @@
-"""The file that keeps a measured pixel scale over a restart: written as one, believed only if whole and ours."""
+"""The file that keeps a measured pixel scale over a restart: written atomically, used only if complete and valid."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stereoreg_ros.uncertainty import checked_scale_covariance
 
 _KIND: Final = "stereoreg_ros pixel scale"
 _MOST_COUNTED: Final = 10**9
-# Of a pixel; also of a standard error, whose square then is a number.
+# Of a pixel; also of a standard error, whose square is then finite.
 _LARGEST_MM: Final = 100.0
 # Recalibration changes a spacing by half at most.
 _LARGEST_FACTOR: Final = 2.0
@@ -35,9 +35,9 @@ class CalibrationFileError(ValueError):
 
 @dataclass(frozen=True)
 class CalibrationRecord:
-    """What a calibration file says.
+    """What a calibration file states.
 
-    scale: as measured, mm/pixel; configured: the scale in place of which it was measured; covariance: (2, 2) of (sx,
+    scale: as measured, mm/pixel; configured: the scale that it replaces; covariance: (2, 2) of (sx,
     sy) or (3, 3) with the shear, mm^2/pixel^2, row by row; frame: name of the frame; slices, rods: from how many; date:
     ISO 8601; software: version.
     """
@@ -75,14 +75,14 @@ class CalibrationRecord:
         return tuple(math.sqrt(row[k]) for k, row in enumerate(self.covariance))
 
     def replaces(self, configured: PixelScale) -> bool:
-        """Whether it was measured in place of this configured scale, and not of another scanner's or zoom's."""
+        """Whether it was measured for this configured scale, not for that of another scanner or zoom."""
         pairs = ((self.configured.sx, configured.sx), (self.configured.sy, configured.sy))
         same = all(abs(ours / theirs - 1) <= _SAME for ours, theirs in pairs)
         return same and abs(self.configured.shear - configured.shear) <= _SAME * configured.sx
 
 
 def save_calibration(path: Path, record: CalibrationRecord) -> None:
-    """Write the file so that whoever reads it, after a crash too, finds the old one or the new one, whole.
+    """Write the file atomically: a reader finds the old or the new one, complete, even after a crash.
 
     Raises OSError where it cannot be written; the old one then stays.
     """
@@ -111,7 +111,7 @@ def remove_calibration(path: Path) -> None:
 
 
 def load_calibration(path: Path) -> CalibrationRecord | None:
-    """What the file says; None where there is none. Raises CalibrationFileError where it cannot be used."""
+    """The record in the file; None where there is no file. Raises CalibrationFileError where it cannot be used."""
     try:
         content = values_of(read_whole(path, MOST_BYTES))
     except FileNotFoundError:

@@ -20,17 +20,20 @@ from stereoreg_ros.options import CalibrationOptions, RegistrationOptions
 
 
 def add_to(commands: Commands) -> None:
-    """Make the command known."""
+    """Add the command."""
     calibrate = commands.add_parser(
         "calibrate",
         help="measure the pixel spacing from DICOM slices that show a frame",
         description="Measures the pixel spacing from all slices together, with a pose for each, and from each slice "
-        "alone, beside what the files say. Scale and size of the frame cannot be told apart from slices.",
+        "alone, and compares it with what the files say. In slices, a spacing that is too large looks the same as a "
+        "frame that is too large.",
         allow_abbrev=False,
     )
     add_series_and_frame(calibrate)
     calibrate.add_argument("--json", action="store_true", help="print one JSON object")
-    calibrate.add_argument("--plot", metavar="FILE", type=Path, help="write a picture of the scale slice by slice, PNG")
+    calibrate.add_argument(
+        "--plot", metavar="FILE", type=Path, help="write a plot of the scale slice by slice to this PNG file"
+    )
     add_options(calibrate.add_argument_group("calibration"), CalibrationOptions)
     add_options(calibrate.add_argument_group("registration"), RegistrationOptions)
     calibrate.set_defaults(command=_calibrate)
@@ -54,15 +57,15 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             else:
                 yield path.name, ct_slice
 
-    with progress_bar("scales tried") as tell:
+    with progress_bar("scales tried") as report:
         try:
-            series = scale_of_series(readable(), frame, options, calibration, tell)
+            series = scale_of_series(readable(), frame, options, calibration, report)
         except ValueError as error:
             complain(str(error))
             return BAD_FILE
     if arguments.plot is not None:
         try:
-            # Only here: nothing else in the package needs matplotlib.
+            # Imported only here: the rest of the command does not need matplotlib.
             from stereoreg_ros.calibration.plot import draw_series_scale
         except ModuleNotFoundError:
             raise WrongCallError(
@@ -77,7 +80,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
 
 def _series_record(series: SeriesScale) -> dict[str, Any]:
-    """The JSON object of a series; null for what was not found."""
+    """The JSON object of a series; null for missing results."""
     outcome = series.outcome
     found = outcome if isinstance(outcome, Calibration) else None
     return {

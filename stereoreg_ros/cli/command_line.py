@@ -1,4 +1,4 @@
-"""`stereoreg COMMAND`: from the words of a call to its exit code."""
+"""`stereoreg COMMAND`: from the arguments of a call to its exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereoreg_ros.cli.parsing import BAD_FILE, INTERRUPTED, WRONG_CALL, Parser,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code: 0, 1 where a file could not be read or written, 2 for a wrong call."""
+    """Entry point; returns the exit code: 0; 1 where a file could not be read or written; 2 for a usage error."""
     given = sys.argv[1:] if arguments is None else arguments
     parsed = _parser().parse_args([shielded(argument) for argument in given])
     try:
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(str(error))
         return WRONG_CALL
     except BrokenPipeError:
-        # Whoever read the output has seen enough. What is still buffered must not fail again at the end.
+        # The reader of the output has closed it. What is still buffered must not fail again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BAD_FILE
     except OSError as error:

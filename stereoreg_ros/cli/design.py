@@ -1,4 +1,4 @@
-"""`stereoreg design`: a frame with a small error at a target, that can be built, tried for ambiguous poses."""
+"""`stereoreg design`: a frame with a small error at a target that can be built, checked for ambiguous poses."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ _AXES: Final = (
 
 
 def add_to(commands: Commands) -> None:
-    """Make the command known."""
+    """Add the command."""
     design = commands.add_parser(
         "design",
         help="propose a frame for a target",
-        description="Searches for the layout of rods, from the lower face of a box to its upper one, with the least "
-        "95 %% error at a target, tries it for ambiguous poses with each rod missing, and writes a frame file with "
-        "the inspector's report. Interrupted, it writes the best so far. Takes some minutes.",
+        description="Searches for the layout of rods, from the lower face of a box to its upper one, with the smallest "
+        "95 %% error at a target, checks it for ambiguous poses with each rod missing in turn, and writes a frame file "
+        "with the inspector's report. If interrupted, it writes the best layout so far. Takes a few minutes.",
         allow_abbrev=False,
     )
     design.add_argument("--name", required=True, help="the frame's name, and that of its files")
@@ -65,7 +65,7 @@ def add_to(commands: Commands) -> None:
         metavar="MM",
         type=float,
         default=5.0,
-        help="least distance between two rods' surfaces, mm (default: 5)",
+        help="smallest distance between the surfaces of two rods, mm (default: 5)",
     )
     design.add_argument(
         "--height",
@@ -73,7 +73,9 @@ def add_to(commands: Commands) -> None:
         type=float,
         help="largest distance of a slice from the frame's middle, mm (default: a quarter of the box's height)",
     )
-    design.add_argument("--chains", metavar="N", type=int, default=8, help="searches, the best counts (default: 8)")
+    design.add_argument(
+        "--chains", metavar="N", type=int, default=8, help="number of searches, of which the best is kept (default: 8)"
+    )
     add_slices(design.add_argument_group("slices"))
     add_options(design.add_argument_group("registration"), RegistrationOptions, USED_OPTIONS)
     design.set_defaults(command=_design)
@@ -98,7 +100,7 @@ def _design(arguments: argparse.Namespace) -> int:
     write_whole(path, frame_text(proposal.frame, _comment(arguments, proposal)))
     print_line(str(path))
     if proposal.interrupted:
-        complain(f"interrupted: {path} is the best layout so far, not tried for ambiguous poses")
+        complain(f"interrupted: {path} is the best layout so far, not checked for ambiguous poses")
         return INTERRUPTED
     inspection = inspected(arguments, path)
     report = table_of(inspection)
@@ -108,8 +110,8 @@ def _design(arguments: argparse.Namespace) -> int:
         print_line(line)
     if proposal.ambiguous:
         complain(
-            f"{path} is the least ambiguous of several, but not free of it: another pose explains {proposal.ambiguous} "
-            f"of {proposal.tried} spot sets as well; more rods make it better"
+            f"{path} is the least ambiguous layout found, but still ambiguous: another pose explains "
+            f"{proposal.ambiguous} of {proposal.tried} spot sets as well; add rods"
         )
         return BAD_FILE
     return OK
@@ -130,17 +132,17 @@ def _wish(arguments: argparse.Namespace, options: RegistrationOptions) -> Wish:
 def _proposed(arguments: argparse.Namespace, wish: Wish, options: RegistrationOptions) -> Proposal:
     with tqdm(total=1.0, leave=False, disable=not watched(), bar_format="{desc} {percentage:3.0f}% |{bar}|") as bar:
 
-        def tell(what: str, share: float, least: float) -> bool:
+        def report(what: str, share: float, least: float) -> bool:
             bar.set_description(f"{what}, {least:.3f} mm", refresh=False)
             bar.n = share
             bar.refresh()
             return True
 
-        return propose(wish, arguments.name, options, arguments.seed, arguments.chains, tell)
+        return propose(wish, arguments.name, options, arguments.seed, arguments.chains, report)
 
 
 def _comment(arguments: argparse.Namespace, proposal: Proposal) -> str:
-    """What came of it, and the call that brings it again."""
+    """The result, and the call that reproduces it."""
     asked = ["stereoreg", "design"]
     names = ("name", "lines", "envelope", "diameter", "gap", "height", "tilt", "pixel_spacing", *USED_OPTIONS)
     for name in (*names, "chains", "seed"):
@@ -149,7 +151,7 @@ def _comment(arguments: argparse.Namespace, proposal: Proposal) -> str:
             values = value if isinstance(value, (tuple, list)) else [value]
             asked.append(f"--{name.replace('_', '-')}")
             asked += [f"{one:g}" if isinstance(one, float) else str(one) for one in values]
-    found = f"95 % target error {proposal.target_error_95_mm:.3f} mm over the slices that were asked for"
+    found = f"95 % target error {proposal.target_error_95_mm:.3f} mm over the requested slices"
     ending = "interrupted" if proposal.interrupted else f"{proposal.ambiguous} of {proposal.tried} spot sets ambiguous"
     return "\n".join(
         [

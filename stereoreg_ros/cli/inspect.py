@@ -1,4 +1,4 @@
-"""`stereoreg inspect`: what a frame can do."""
+"""`stereoreg inspect`: how well a frame can be registered."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ USED_OPTIONS: Final = (
 
 
 def add_to(commands: Commands) -> None:
-    """Make the command known."""
+    """Add the command."""
     inspect = commands.add_parser(
         "inspect",
-        help="tell what a frame can do",
-        description="Tells of a frame, over the slices that can meet it: which rods they show, what error to expect at "
-        "the frame's origin and at a target, how often another pose explains them as well, and what is weak.",
+        help="report how well a frame can be registered",
+        description="Reports, over the slices that can cut a frame, which rods they show, what error to expect at the "
+        "frame's origin and at a target, how often another pose explains them as well, and the frame's weak points.",
         allow_abbrev=False,
     )
     inspect.add_argument("--frame", metavar="F", required=True, help="frame file, or name of a shipped frame")
@@ -47,7 +47,7 @@ def add_to(commands: Commands) -> None:
 
 
 def add_slices(group: argparse._ArgumentGroup) -> None:
-    """Options of the slices that are taken, and of what is drawn at random."""
+    """Options of the slices, and of the random numbers."""
     group.add_argument(
         "--pixel-spacing",
         metavar=("SX", "SY"),
@@ -59,14 +59,12 @@ def add_slices(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--tilt", metavar="DEG", type=float, default=30.0, help="largest tilt of a slice, degrees (default: 30)"
     )
-    group.add_argument(
-        "--poses", metavar="N", type=int, default=200, help="number of slices the inspector looks at (default: 200)"
-    )
+    group.add_argument("--poses", metavar="N", type=int, default=200, help="number of slices to inspect (default: 200)")
     group.add_argument("--seed", metavar="N", type=int, default=0, help="seed of everything random (default: 0)")
 
 
 def inspected(arguments: argparse.Namespace, source: str | Path) -> Inspection:
-    """Inspect a frame as the command line has it; WrongCallError where that cannot be."""
+    """Inspect a frame with the options of the command line; WrongCallError where they are invalid."""
     if arguments.seed < 0:
         raise WrongCallError(f"--seed is {arguments.seed}, expected 0 or more")
     if not 1 <= arguments.poses <= 100_000:
@@ -75,16 +73,16 @@ def inspected(arguments: argparse.Namespace, source: str | Path) -> Inspection:
         frame = load_frame(source)
         options = given(RegistrationOptions, arguments, USED_OPTIONS)
         scale = PixelScale(*arguments.pixel_spacing)
-        with progress_bar(f"inspecting {frame.name}") as tell:
-            return inspect_frame(frame, options, scale, arguments.tilt, arguments.poses, arguments.seed, tell)
+        with progress_bar(f"inspecting {frame.name}") as report:
+            return inspect_frame(frame, options, scale, arguments.tilt, arguments.poses, arguments.seed, report)
     except (FrameFileError, ValueError) as error:
         raise WrongCallError(str(error)) from None
 
 
 def draw(inspection: Inspection, path: Path) -> None:
-    """Write the picture; WrongCallError where nothing can draw."""
+    """Write the picture; WrongCallError where matplotlib is missing."""
     try:
-        # Only here: what needs no picture needs no matplotlib.
+        # Imported only here: without a picture, matplotlib is not needed.
         from stereoreg_ros.frames.inspection_plot import draw_inspection
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] not in ("matplotlib", "mpl_toolkits"):

@@ -18,30 +18,30 @@ def complain(sentence: str) -> None:
 
 
 def print_line(line: str) -> None:
-    """A line of the result."""
+    """A line of the result on standard output."""
     _write(line, sys.stdout)
 
 
 def _write(line: str, stream: TextIO) -> None:
-    """Write a line and draw the progress bar anew below it, if there is one."""
-    # File names need not be text, nor text that the terminal can show.
+    """Write a line and redraw the progress bar, if there is one, below it."""
+    # File names may contain what the terminal cannot show.
     encoding = stream.encoding or "utf-8"
     tqdm.write(line.encode(encoding, errors="replace").decode(encoding), file=stream)
     stream.flush()
 
 
 def watched() -> bool:
-    """Whether somebody may see a progress bar."""
+    """Whether standard error is a terminal, which can show a progress bar."""
     return sys.stderr.isatty()
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], bool]]:
-    """A bar on standard error, shown only where somebody watches; told the share that is done, it says to go on."""
+    """A bar on a terminal's standard error; its callback takes the share that is done, and says to go on."""
     with tqdm(total=1.0, desc=what, leave=False, disable=not watched(), file=sys.stderr) as bar:
 
-        def tell(share: float) -> bool:
+        def report(share: float) -> bool:
             bar.update(max(share - bar.n, 0.0))
             return True
 
-        yield tell
+        yield report

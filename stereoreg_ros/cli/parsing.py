@@ -1,4 +1,4 @@
-"""What the commands' parsers have in common: options from the tables of options, and faults as one sentence."""
+"""Shared by the commands' parsers: arguments from the tables of options, and errors as one sentence."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ INTERRUPTED: Final = 130
 
 
 class WrongCallError(Exception):
-    """The command cannot be carried out as it was given; the text is one sentence."""
+    """The command cannot be run with these arguments; the text is one sentence."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that says what is wrong in one sentence."""
+    """A parser that reports an error in one sentence."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(WRONG_CALL, f"{self.prog}: {message}\n")
@@ -45,7 +45,7 @@ def add_options(
     options: type[RegistrationOptions | CalibrationOptions],
     only: Sequence[str] | None = None,
 ) -> None:
-    """A command-line option for every field, or for some."""
+    """A command-line option for every field, or for those in `only`."""
     for entry in fields(options):
         if only is not None and entry.name not in only:
             continue
@@ -72,12 +72,12 @@ def add_options(
 
 
 def _number_or(word: str) -> Callable[[str], float | str]:
-    """What reads a number or the word."""
+    """A function that reads a number or the word."""
 
     def read(text: str) -> float | str:
         return word if text.strip() == word else float(text)
 
-    read.__name__ = "float"  # as argparse names it where it can be read as neither
+    read.__name__ = "float"  # the type that argparse names in its error
     return read
 
 
@@ -88,8 +88,8 @@ def given(options: type[_Options], arguments: argparse.Namespace, only: Sequence
 
 
 def make_folder(option: str, folder: Path) -> None:
-    """Make the folder where it is missing; WrongCallError where that cannot be."""
+    """Create the folder where it is missing; WrongCallError where that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise WrongCallError(f"{option}: {folder} cannot be made a folder: {error.strerror}") from None
+        raise WrongCallError(f"{option}: {folder} cannot be created: {error.strerror}") from None

@@ -37,7 +37,7 @@ _LARGEST_SPOT_ERROR_PX: Final = 10.0
 
 @dataclass(frozen=True, eq=False)
 class _Registered:
-    """A slice that was read: its pixels and what came of them."""
+    """A slice that was read, and its result."""
 
     path: Path
     ct_slice: Slice
@@ -56,22 +56,24 @@ class _Unreadable:
 
 
 def add_to(commands: Commands) -> None:
-    """Make the command known."""
+    """Add the command."""
     register = commands.add_parser(
         "register",
         help="find the pose of a frame in DICOM slices",
-        description="Finds the pose of a frame in each DICOM slice by itself. A slice without a pose that may be "
-        "believed is refused with the reason; that is no error.",
+        description="Finds the pose of a frame in each DICOM slice by itself. A slice whose pose cannot be trusted is "
+        "refused with a reason; the exit code is 0 all the same.",
         allow_abbrev=False,
     )
     add_series_and_frame(register)
     register.add_argument("--json", action="store_true", help="print one JSON object per slice, each on a line")
-    register.add_argument("--overlay", metavar="DIR", type=Path, help="write a picture of each slice to this folder")
+    register.add_argument(
+        "--overlay", metavar="DIR", type=Path, help="write an annotated picture of each slice to this folder"
+    )
     register.add_argument(
         "--max-spot-error",
         metavar="PX",
         type=float,
-        help="bound the errors of the pose and at the target where no coordinate of a spot is off by more, pixel",
+        help="also bound the errors of the pose and at the target, if no spot coordinate is off by more, pixel",
     )
     scale = register.add_argument_group("pixel scale")
     scale.add_argument(
@@ -93,7 +95,7 @@ def _register(arguments: argparse.Namespace) -> int:
     try:
         frame = load_frame(arguments.frame)
         options = given(RegistrationOptions, arguments)
-        # A scale for nothing but the check, where the spacing is the file's.
+        # Where the spacing is the file's, the scale serves only to check the shear.
         sx, sy = arguments.pixel_spacing or (1.0, 1.0)
         own_scale = PixelScale(sx, sy, arguments.pixel_shear)
         _check_spot_error(arguments.max_spot_error)
@@ -175,7 +177,7 @@ def _record(outcome: _Registered | _Unreadable, frame: Frame, *, slice_axes: boo
 
 
 def _worst_record(worst: WorstCase | None) -> dict[str, Any]:
-    """Bounds of the errors; null where there is no pose, or where none can be proven."""
+    """Bounds on the errors; null where there is no pose, or where none can be proven."""
     return {
         "worst_case_target_error_mm": worst.target_error_mm if worst else None,
         "worst_case_position_mm": worst.position_mm.tolist() if worst else None,
@@ -224,7 +226,7 @@ def _table_line(outcome: _Registered | _Unreadable) -> str:
 
 def _worst_words(max_spot_error_px: float, worst: WorstCase | None) -> str:
     if worst is None:
-        return f"no bound of the target's error for spots {max_spot_error_px:g} pixel off"
+        return f"no bound on the target error for spots {max_spot_error_px:g} pixel off"
     return f"target off by at most {worst.target_error_mm:.2f} mm"
 
 
@@ -241,7 +243,7 @@ def _summary(outcomes: Counter[str]) -> str:
 
 
 class _Pictures:
-    """Writes overlays to a folder, which is made; each under a name of its own."""
+    """Writes overlays to a folder, which it creates, each under a name of its own."""
 
     def __init__(self, folder: Path) -> None:
         make_folder("--overlay", folder)
@@ -260,5 +262,5 @@ class _Pictures:
         done, content = cv2.imencode(".png", picture)
         if not done:
             raise OSError(f"{name}.png: cannot be encoded")
-        # Not by imwrite, which tells of a full disk or a missing right by nothing but False.
+        # Not by imwrite, which reports a full disk or a missing permission only by False.
         (self._folder / f"{name}.png").write_bytes(content.tobytes())

@@ -10,16 +10,16 @@ from stereoreg_ros.cli.parsing import OK, Commands, WrongCallError, make_folder
 
 
 def add_to(commands: Commands) -> None:
-    """Make the command known."""
+    """Add the command."""
     reproduce = commands.add_parser(
         "reproduce",
-        help="repeat the results section of Maurin 2009, simulated",
+        help="repeat the results section of Maurin 2009 with simulated data",
         description="Repeats section 6 of Maurin 2009 with simulated data and writes a report (report.md, PNG, CSV) "
-        "that puts the paper's figures beside ours. The full run takes about a quarter of an hour.",
+        "that compares the paper's figures with ours. The full run takes about a quarter of an hour.",
         allow_abbrev=False,
     )
     reproduce.add_argument(
-        "--output", metavar="DIR", type=Path, required=True, help="folder for the report, made where it is missing"
+        "--output", metavar="DIR", type=Path, required=True, help="folder for the report, created if missing"
     )
     reproduce.add_argument("--quick", action="store_true", help="fewer poses and levels: done within two minutes")
     reproduce.add_argument("--seed", metavar="N", type=int, default=0, help="seed of everything random (default: 0)")
@@ -31,7 +31,7 @@ def _reproduce(arguments: argparse.Namespace) -> int:
     if arguments.seed < 0:
         raise WrongCallError(f"--seed is {arguments.seed}, expected 0 or more")
     try:
-        # Only here: nothing else in the package needs matplotlib.
+        # Imported only here: the other commands do without matplotlib.
         from stereoreg_ros.reproduction.run import reproduce
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] != "matplotlib":

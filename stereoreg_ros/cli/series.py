@@ -1,4 +1,4 @@
-"""The slices that a command is given, and the frame that it looks for in them."""
+"""The slices given to a command, and the frame that it looks for in them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_series_and_frame(parser: argparse.ArgumentParser) -> None:
 
 
 def slices_of(paths: Sequence[Path], *, slice_axes: bool) -> Iterator[tuple[Path, Slice | DicomError]]:
-    """Every slice of every path, read when it is its turn; in place of one that cannot be read, why.
+    """Every slice of every path, read one by one; in place of one that cannot be read, its fault.
 
     slice_axes: whether each is in its own axes, whatever its file says.
     """

@@ -1,4 +1,4 @@
-"""What a compressed image says of its size, before a decoder takes memory for it."""
+"""The size that a compressed image states, before a decoder allocates memory for it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MARKER_PREFIX: Final = 0xFF
 # Number of segments, and where each begins.
 _RLE_HEADER: Final = struct.Struct("<16I")
 _RLE_NOTHING: Final = 128
-# So many bytes behind a segment are harmless.
+# Bytes behind a segment that are harmless.
 _RLE_PADDING: Final = 256
 _ALONE: Final = {0x01, *range(0xD0, 0xDA)}
 
@@ -37,10 +37,10 @@ class CodestreamSize:
 
 
 def size_of(codestream: bytes) -> CodestreamSize:
-    """Size of a JPEG, JPEG-LS or JPEG 2000 image; ValueError where it does not say it as it should."""
+    """Size of a JPEG, JPEG-LS or JPEG 2000 image; ValueError where it is not stated properly."""
     if codestream.startswith(_JPEG_START):
         return _jpeg(codestream)
-    # A JPEG 2000 file, which is not allowed for but is met, has other boxes before the image, and might hide another.
+    # A whole JPEG 2000 file, which DICOM forbids but which occurs, has other boxes before the image.
     start = _in_boxes(codestream) if codestream.startswith(_JPEG_2000_FILE) else 0
     if not codestream.startswith(_JPEG_2000_START, start):
         raise ValueError("found the start of no JPEG and of no JPEG 2000 image")
@@ -58,7 +58,7 @@ def _in_boxes(file: bytes) -> int:
         length, kind = _JPEG_2000_BOX.unpack_from(file, place)
         if kind == b"jp2c":
             return place + _JPEG_2000_BOX.size
-        # Of a box of 0 bytes, which goes on to the end, or one with its length elsewhere, no scanner makes use.
+        # No scanner writes a box of length 0, which extends to the end, or one whose length is stored elsewhere.
         if length < _JPEG_2000_BOX.size:
             break
         place += length
@@ -68,7 +68,7 @@ def _in_boxes(file: bytes) -> int:
 def require_rle_size(codestream: bytes, pixels: int) -> None:
     """ValueError where a segment of an RLE image unpacks to many more bytes than there are pixels.
 
-    A packet of two bytes stands for up to 128: a decoder that only compares afterwards takes sixty times the memory.
+    A packet of two bytes unpacks to up to 128: a decoder that checks only afterwards takes sixty times the memory.
     """
     count, *offsets = _RLE_HEADER.unpack(codestream[: _RLE_HEADER.size].ljust(_RLE_HEADER.size, b"\0"))
     if not 1 <= count <= len(offsets):
@@ -86,7 +86,7 @@ def require_rle_size(codestream: bytes, pixels: int) -> None:
                 length += 257 - packet
                 place += 2
             else:
-                # Each takes its time, and no encoder has many.
+                # Each takes time to skip, and no encoder writes many.
                 length += 1
                 place += 1
         if place < len(segment):

@@ -1,4 +1,4 @@
-"""A DICOM file, or its bytes -> data set of pydicom, as large as it may be and no larger."""
+"""A DICOM file, or its bytes -> pydicom data set, within a limit of size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
 from stereoreg_ros.dicom.elements import DicomError, reading
 from stereoreg_ros.files.whole_file import read_whole
 
-# Of a file on the disk. What comes over the network has a bound of its own.
+# For a file on disk. What comes over the network has a limit of its own.
 _MAX_INFLATED_BYTES: Final = 2**30
 FOLDER: Final = "a folder"
 _NO_LETTERS: Final = "not a DICOM file: found no letters DICM at byte 128"
@@ -29,9 +29,9 @@ _META_LENGTH_TAG: Final = b"\x02\x00\x00\x00UL\x04\x00"
 
 
 def not_dicom(file: Path) -> str | None:
-    """What the file is if it is no DICOM file, else None; by the four letters that every DICOM file bears."""
+    """What the file is if it is not a DICOM file, else None; judged by the four letters in every DICOM file."""
     try:
-        # Opening a pipe or a device would wait for ever.
+        # Opening a pipe or a device could block forever.
         if file.is_dir():
             return FOLDER
         if not file.exists():
@@ -62,7 +62,7 @@ def read_dataset(file: Path, *, stop_before_pixels: bool) -> pydicom.Dataset:
 
 
 def parsed(name: Path, content: bytes, max_bytes: int) -> pydicom.Dataset:
-    """The data set of a file in memory; max_bytes: most that it may take when it is inflated. Raises DicomError."""
+    """The data set of a file in memory; max_bytes: the most it may take when inflated. Raises DicomError."""
     if content[128:_META_START] != b"DICM":
         raise DicomError(name, f"{_NO_LETTERS}, expected a DICOM file")
     return _parse(name, BytesIO(_inflated(name, content, max_bytes)), stop_before_pixels=False)
@@ -75,9 +75,9 @@ def _parse(file: Path, source: Path | BytesIO, *, stop_before_pixels: bool) -> p
 
 
 def _inflated(name: Path, content: bytes, max_bytes: int) -> bytes:
-    """The file with its data set as it is without the deflated transfer syntax.
+    """The file with its data set inflated, if it has the deflated transfer syntax.
 
-    pydicom itself would inflate without a bound.
+    pydicom itself would inflate without a limit.
     """
     if len(content) < _META_START + _META_LENGTH.size:
         raise DicomError(name, f"is damaged: has {len(content)} bytes, expected a whole DICOM file")

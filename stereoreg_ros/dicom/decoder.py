@@ -1,4 +1,4 @@
-"""The process that decodes for `decoding`: run as a program, with nothing of this package, so that it starts quickly.
+"""The process that decodes for `decoding`: a program that imports nothing of this package, so that it starts quickly.
 
 On standard input come messages, each after its length in eight bytes: the elements of an image as JSON, and its
 compressed pixels. On standard output go messages, first an empty one: `a` and the array as numpy writes it, or `e` and
@@ -34,7 +34,7 @@ def main() -> None:
             array = io.BytesIO()
             np.save(array, _decoded(json.loads(elements), pixels), allow_pickle=False)
             answer = b"a" + array.getvalue()
-        # Decoders and pydicom raise nearly anything.
+        # Decoders and pydicom may raise almost anything.
         except Exception as error:
             answer = b"e" + (str(error) or type(error).__name__).encode(errors="replace")
         _write(answers, answer)

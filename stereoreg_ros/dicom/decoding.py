@@ -1,7 +1,8 @@
 """Compressed pixels -> values, in a process of its own: decoders are C code, which a damaged image can hang or crash.
 
-One process (`decoder`) serves all images, one at a time, and is started when the first one comes. For each it has so
-much time; then it is killed, and the next image gets a new one. It ends with the process that started it.
+One process (`decoder`) serves all images, one at a time, and is started for the first one. It has a time limit for
+each image; where it exceeds that, it is killed, and the next image gets a new one. It ends with the process that
+started it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 _PROGRAM: Final = Path(__file__).with_name("decoder.py")
-# What decoders go by, besides the pixels and the transfer syntax.
+# What decoders need besides the pixels and the transfer syntax.
 _KEYWORDS: Final = (
     "SamplesPerPixel",
     "PhotometricInterpretation",
@@ -47,13 +48,13 @@ class DecodingError(Exception):
 
 
 class _EndedError(DecodingError):
-    """The decoder's process came to its end instead of answering."""
+    """The decoder process ended instead of answering."""
 
 
 def decoded(dataset: Dataset) -> NDArray[Any]:
     """Stored values (rows, columns) of a data set with one compressed image, whose elements have been checked.
 
-    Raises DecodingError where the decoder cannot make anything of it, takes too long, or comes to its end over it.
+    Raises DecodingError where the decoder cannot decode it, takes too long, or ends.
     """
     elements = {keyword: dataset.get(keyword) for keyword in _KEYWORDS}
     elements["TransferSyntaxUID"] = str(dataset.file_meta.TransferSyntaxUID)
@@ -64,7 +65,7 @@ def decoded(dataset: Dataset) -> NDArray[Any]:
         try:
             answer = _decoder().ask(messages, limit_s)
         except _EndedError:
-            # Not over this image, perhaps.
+            # Perhaps for another reason than this image.
             answer = _decoder().ask(messages, limit_s)
     if not answer.startswith(b"a"):
         raise DecodingError(answer[1:].decode(errors="replace"))
@@ -73,7 +74,7 @@ def decoded(dataset: Dataset) -> NDArray[Any]:
 
 
 class _Decoder:
-    """The process, for whoever started it."""
+    """The process, as seen by the one that started it."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -81,20 +82,20 @@ class _Decoder:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            # A terminal's Ctrl-C is not for it: it ends when its input does.
+            # It ends when its input does, not by a terminal's Ctrl-C.
             start_new_session=True,
-            # It finds what this process finds, and takes nothing of its folder for a library.
+            # It finds the modules that this process finds, and does not take files beside the program for modules.
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONSAFEPATH": "1"},
         )
         self.ask((), _START_S)
 
     @property
     def is_alive(self) -> bool:
-        """Whether it can be asked."""
+        """Whether the process is running."""
         return self._process.poll() is None
 
     def ask(self, messages: tuple[bytes, ...], limit_s: float) -> bytes:
-        """What it answers within so many seconds; else DecodingError, and the process is gone."""
+        """Its answer within `limit_s` seconds; else DecodingError, and the process is gone."""
         assert self._process.stdin is not None
         try:
             for message in messages:
@@ -112,7 +113,7 @@ class _Decoder:
         return answer
 
     def _answer(self, deadline_s: float) -> bytes | None:
-        """None where the process ends instead."""
+        """The answer; None where the process ends instead."""
         assert self._process.stdout is not None
         received, wanted = bytearray(), _LENGTH_BYTES
         with selectors.DefaultSelector() as selector:
@@ -129,19 +130,19 @@ class _Decoder:
         return bytes(received[_LENGTH_BYTES:])
 
     def end(self) -> None:
-        """End it, if it has not ended by itself."""
+        """End the process, if it is still running."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         if self.is_alive:
             self._process.kill()
         self._process.wait()
         self._process.stdout.close()
-        with contextlib.suppress(OSError):  # Some of it may not be written any more.
+        with contextlib.suppress(OSError):  # Unwritten input may be left.
             self._process.stdin.close()
 
 
 _lock: Final = threading.Lock()
-# By the process that started it: one that was forked must not share the pipes.
+# By the id of the process that started it: a forked one must not share the pipes.
 _decoders: Final[dict[int, _Decoder]] = {}
 
 

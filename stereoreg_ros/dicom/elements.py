@@ -1,4 +1,4 @@
-"""Elements of a DICOM data set, or a DicomError that names the element, what was found and what was expected."""
+"""Elements of a DICOM data set; a DicomError names the element, what was found and what was expected."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class DicomError(ValueError):
 
 @contextmanager
 def reading(file: Path, problem: str) -> Iterator[None]:
-    """Run pydicom on what may be damaged: no warnings, and nothing raised but a DicomError that says `problem`."""
+    """Run pydicom on possibly damaged data: no warnings, and no exception but a DicomError that says `problem`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             yield
-        # It raises nearly anything then, struct.error and AttributeError among it.
+        # On damaged data it raises almost anything, including struct.error and AttributeError.
         except Exception as error:
             cause = _shortened(" ".join(str(error).split())) or type(error).__name__
             raise DicomError(file, f"{problem}: {cause}") from error
@@ -41,14 +41,14 @@ def reading(file: Path, problem: str) -> Iterator[None]:
 
 def element_value(file: Path, dataset: pydicom.Dataset, keyword: str) -> Any:
     """The element's value, or None where it is missing or empty."""
-    # Elements are converted when they are asked for, so this is where their faults show.
+    # pydicom converts elements on access, so this is where faults show.
     with reading(file, f"{tag_text(keyword)} cannot be read"):
         value = dataset.get(keyword)
     return None if value is None or value == "" or value == [] else value
 
 
 def element_numbers(file: Path, dataset: pydicom.Dataset, keyword: str, count: int) -> list[float]:
-    """The element's finite numbers, so many; DicomError where it has others."""
+    """The element's `count` finite numbers; DicomError where it has anything else."""
     expected = "a finite number" if count == 1 else f"{count} finite numbers"
     value = element_value(file, dataset, keyword)
     if value is None:
@@ -63,7 +63,7 @@ def element_numbers(file: Path, dataset: pydicom.Dataset, keyword: str, count: i
 
 
 def element_integer(file: Path, dataset: pydicom.Dataset, keyword: str, low: int, high: int) -> int:
-    """The element's whole number, from low to high; DicomError where it has another."""
+    """The element's whole number, from low to high; DicomError where it has anything else."""
     expected = f"{low}" if low == high else f"a whole number from {low} to {high}"
     value = element_value(file, dataset, keyword)
     if value is None:
@@ -93,5 +93,5 @@ def element_fault(file: Path, keyword: str, found: object, expected: str, *, quo
 
 
 def _shortened(text: str) -> str:
-    """Text that may repeat what an object holds, however long that is."""
+    """Text with at most _LONGEST_TEXT characters of what an object holds."""
     return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."

@@ -1,4 +1,4 @@
-"""Data set -> what an image says besides its pixels: size, pixel scale, plane in patient axes (LPS, mm), rescale."""
+"""Data set -> what an image states besides its pixels: size, pixel scale, plane in patient axes (LPS, mm), rescale."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MONOCHROME: Final = ("MONOCHROME2", "MONOCHROME1")
 
 @dataclass(frozen=True, eq=False)
 class SliceHeader:
-    """What a DICOM image says besides its pixels.
+    """What a DICOM image states besides its pixels.
 
     path: the file. scale: mm/pixel. scanner_from_slice: plane of the slice in patient axes (LPS), mm; has_plane:
     false where the slice's own axes were asked for, and the pose is the identity, whatever the file says.
@@ -94,10 +94,10 @@ def read_header(file: Path, dataset: pydicom.Dataset, *, slice_axes: bool = Fals
 
 
 def not_image(file: Path, dataset: pydicom.Dataset) -> str | None:
-    """The name of the object's class where that is no class of images, else None."""
+    """The name of the object's class where that is not a class of images, else None."""
     uid = element_value(file, dataset, "SOPClassUID")
     if uid is None:
-        # DICOMDIR and objects of careless writers: they are images where they have rows and columns.
+        # A DICOMDIR, or an object from a careless writer: an image if it has rows and columns.
         return None if "Rows" in dataset and "Columns" in dataset else "no image, and no SOP Class UID (0008,0016)"
     with reading(file, f"{tag_text('SOPClassUID')} cannot be read"):
         name = UID(str(uid)).name

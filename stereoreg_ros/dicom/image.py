@@ -49,7 +49,7 @@ def read_frames(name: Path, content: bytes, max_bytes: int, uid: str = "") -> tu
     _require_decoded_size(name, dataset, max_bytes)
     frames = [dataset]
     if element_value(name, dataset, "SOPClassUID") == EnhancedCTImageStorage:
-        with reading(name, "the frames of the Enhanced CT image cannot be told apart"):
+        with reading(name, "the frames of the Enhanced CT image cannot be separated"):
             frames = single_frames(dataset)
     return tuple(_slice_of(name, frame) for frame in frames)
 
@@ -60,7 +60,7 @@ def _slice_of(file: Path, dataset: pydicom.Dataset, *, slice_axes: bool = False)
 
 
 def _require_decoded_size(name: Path, dataset: pydicom.Dataset, max_bytes: int) -> None:
-    """Before anything is decoded: a small object may claim, and fill, a very large image."""
+    """Before anything is decoded: a small object may unpack to a very large image."""
     rows, columns = (element_integer(name, dataset, keyword, 1, MAX_SIDE_PX) for keyword in ("Rows", "Columns"))
     allocated = element_integer(name, dataset, "BitsAllocated", 8, 32)
     frames = 1

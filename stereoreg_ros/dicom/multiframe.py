@@ -9,7 +9,7 @@ from pydicom import encaps
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import UID
 
-# What a classic image says of itself, an enhanced one says in these groups: of all its frames, or of each.
+# What a classic image states at its top level, an enhanced one states in these groups: for all frames, or for each.
 _GROUPS: Final = {
     "PixelMeasuresSequence": ("PixelSpacing",),
     "PlanePositionSequence": ("ImagePositionPatient",),

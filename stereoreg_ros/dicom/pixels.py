@@ -1,4 +1,4 @@
-"""Data set -> pixels in HU: decoded, within the bits that count, padding made dark."""
+"""Data set -> pixels in HU: decoded, unused bits removed, padding made dark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stereoreg_ros.geometry.slice import LARGEST_HU
 
 
 def read_hu(header: SliceHeader, dataset: pydicom.Dataset) -> NDArray[np.float32]:
-    """HU (rows, columns) of an image of which the header is read; raises DicomError."""
+    """HU (rows, columns) of an image whose header has been read; raises DicomError."""
     file = header.path
     stored = _read_stored(header, dataset)
     hu = stored.astype(np.float64) * header.rescale_slope + header.rescale_intercept
@@ -27,7 +27,7 @@ def read_hu(header: SliceHeader, dataset: pydicom.Dataset) -> NDArray[np.float32
     if padding is not None:
         if padding.all():
             raise DicomError(file, f"every pixel has a {tag_text('PixelPaddingValue')}, expected an image")
-        # Padding may stand for any HU, also for one above the threshold: it must not look like metal.
+        # Padding may stand for any HU, even one above the threshold: it must not look like metal.
         hu[padding] = hu[~padding].min()
     if not np.abs(hu).max() <= LARGEST_HU:
         raise DicomError(file, f"HU reach {np.abs(hu).max():g}, expected {LARGEST_HU:g} at most")
@@ -73,7 +73,7 @@ def _read_stored(header: SliceHeader, dataset: pydicom.Dataset) -> NDArray[Any]:
 
 
 def _require_codestream_size(header: SliceHeader, dataset: pydicom.Dataset, syntax: UID) -> None:
-    """A decoder goes by what the compressed image says, whatever the object says."""
+    """A decoder follows the size in the compressed image, whatever the object states."""
     with reading(header.path, f"{tag_text('TransferSyntaxUID')} is {syntax}, expected one of images"):
         if not syntax.is_encapsulated:
             return
@@ -91,11 +91,11 @@ def _require_codestream_size(header: SliceHeader, dataset: pydicom.Dataset, synt
 
 
 def _without_unused_bits(stored: NDArray[Any], bits: int, signed: bool) -> NDArray[Any]:
-    """Values of `bits` bits: what lies above them (overlays, in old files) removed, the sign carried upwards."""
+    """Values of `bits` bits: higher bits (overlays, in old files) removed, the sign extended."""
     unused = 8 * stored.dtype.itemsize - bits
     if unused <= 0:
         return stored
-    # Values of a big-endian file keep that order; looked at as other integers, they would be other values.
+    # Values of a big-endian file keep that order; viewed as native integers, they would be other values.
     stored = stored.astype(stored.dtype.newbyteorder("="), copy=False)
     integer = stored.view(np.dtype(f"{'i' if signed else 'u'}{stored.dtype.itemsize}"))
     clean: NDArray[Any] = (integer << unused) >> unused

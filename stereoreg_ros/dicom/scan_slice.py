@@ -1,4 +1,4 @@
-"""Whether an image is a slice of a scan: one plane whose place in the scanner is stated, with values that mean HU."""
+"""Whether an image is a slice of a scan: a plane with a stated position in the scanner, and values that map to HU."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _OWN_AXES: Final = (
 def require_scan_slice(file: Path, dataset: pydicom.Dataset) -> None:
     """DicomError where an image is a projection or a secondary capture, has no plane, or is CT without rescale.
 
-    A pose found in such an image would be believed to lie in the scanner, and does not. The class of an object that
-    names none, or one that the DICOM dictionary does not have, is not held against it.
+    A pose found in such an image would be taken for one in the scanner, which it is not. An object without a class, or
+    with one that the DICOM dictionary does not know, is judged by the rest.
     """
     uid = element_value(file, dataset, "SOPClassUID")
     with reading(file, f"{tag_text('SOPClassUID')} cannot be read"):

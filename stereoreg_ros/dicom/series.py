@@ -24,7 +24,7 @@ _SAME_SPACING: Final = 1e-4
 
 @dataclass(frozen=True)
 class Skipped:
-    """A file in a folder that is no DICOM image, and what it is instead."""
+    """A file in a folder that is not a DICOM image, and what it is instead."""
 
     path: Path
     what: str
@@ -57,8 +57,8 @@ def read_series(
 ) -> DicomSeries:
     """Read the headers of one series: a DICOM file, or a folder (without its subfolders).
 
-    What is no image (structure sets, plans, files that are not DICOM) is skipped and listed in the result.
-    on_fault: called for an image with a fault, which is then left out; by default the fault is raised.
+    What is not an image (structure sets, plans, files that are not DICOM) is skipped and listed in the result.
+    on_fault: called with the fault of each faulty image, which is then left out; by default the fault is raised.
     slice_axes: take every image for a slice in its own axes, as `read_slice` does, wherever it lies.
     Raises DicomError for a faulty image, and where the images are not one series of parallel slices.
     """
@@ -127,7 +127,7 @@ def _differs(header: SliceHeader, first: SliceHeader, keyword: str, found: Array
 
 
 def _order(header: SliceHeader) -> tuple[int, int]:
-    """Table order; slices taken at one table position, as in CT fluoroscopy, in the order of their numbers."""
+    """Table order; slices at the same table position, as in CT fluoroscopy, by instance number."""
     return round(header.table_position_mm / _SAME_POSITION_MM), header.instance_number or 0
 
 
@@ -138,5 +138,5 @@ def _require_distinct(folder: Path, headers: list[SliceHeader]) -> None:
                 folder,
                 f"{header.path.name} and {following.path.name} lie at the same position, "
                 f"{header.table_position_mm:.3f} mm along their normal, and have the same instance number, "
-                f"expected them to differ in one (0020,0032; 0020,0013)",
+                f"expected them to differ in one of the two (0020,0032; 0020,0013)",
             )

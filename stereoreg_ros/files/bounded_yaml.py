@@ -1,4 +1,4 @@
-"""YAML from outside, composed to nodes but to no Python objects, within bounds that are reached in a moment."""
+"""YAML from outside, composed to nodes but not to Python objects, within limits of size and depth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SHOWN: Final = 60
 
 
 class UnusableYamlError(ValueError):
-    """Text that is no YAML, or more of it than the bounds allow. line: where, from 1, or None."""
+    """Text that is not YAML, or exceeds the limits. line: where, from 1, or None."""
 
     def __init__(self, problem: str, line: int | None = None) -> None:
         super().__init__(problem)
@@ -25,7 +25,7 @@ class UnusableYamlError(ValueError):
 def compose(content: bytes) -> yaml.Node | None:
     """The root node of the only document of a file of at most MOST_BYTES; None where the file is empty.
 
-    Aliases stay what they are, the same node again: whoever walks over the nodes bounds the depth of the walk.
+    An alias is the same node again: a walk over the nodes must limit its own depth.
     Raises UnusableYamlError.
     """
     try:
@@ -41,7 +41,7 @@ def compose(content: bytes) -> yaml.Node | None:
         mark = error.problem_mark
         problem = shown(error.problem or error.context or "")
         raise UnusableYamlError(f"is not valid YAML: {problem}", mark.line + 1 if mark else None) from None
-    # The scanner takes the digits of \U, of a directive's version and of an indentation for numbers that Python has.
+    # The scanner converts the digits of \U, of a directive's version and of an indentation to numbers without a check.
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         if isinstance(error, UnusableYamlError):
             raise
@@ -50,7 +50,7 @@ def compose(content: bytes) -> yaml.Node | None:
 
 
 def shown(text: str) -> str:
-    """Text from a file as a message may repeat it: in one line, and not for pages."""
+    """Text from a file as a message may quote it: in one line, and short."""
     printable = "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
     return printable if len(printable) <= _SHOWN else f"{printable[:_SHOWN]}..."
 

@@ -1,4 +1,4 @@
-"""Paths as somebody typed them where no shell expands `~`, as in the arguments of a launch file."""
+"""Paths as a user typed them where no shell expands `~`, as in the arguments of a launch file."""
 
 from __future__ import annotations
 

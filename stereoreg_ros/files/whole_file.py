@@ -1,4 +1,4 @@
-"""Files written so that they are the old one or the new one, whole, whatever happens meanwhile; and read as a whole."""
+"""Files written atomically and durably, so that a reader finds the old or the new one, whole; and read as a whole."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def remove_unfinished(folder: Path) -> None:
 def read_whole(path: Path, most_bytes: int) -> bytes:
     """The content of a regular file; OSError where it cannot be read, is larger, or is a pipe or a device.
 
-    Those would be waited for, or never end.
+    Reading those could block, or never end.
     """
     try:
-        # An open of a pipe does not wait for the other end then.
+        # Opened so, a pipe does not wait for its other end.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except ValueError as error:
         raise OSError(errno.EINVAL, f"no name of a file: {error}") from None
@@ -57,7 +57,7 @@ def read_whole(path: Path, most_bytes: int) -> bytes:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the folder's entries on the disk, not only the files."""
+    """Write the folder's entries to the disk, not only the files."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

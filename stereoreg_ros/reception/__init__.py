@@ -1,1 +1,1 @@
-"""Slices that come from a scanner, over DICOM's network or through a folder; knows nothing of ROS."""
+"""Slices from a scanner, over a DICOM association or through a folder; without ROS."""

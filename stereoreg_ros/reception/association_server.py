@@ -1,4 +1,4 @@
-"""The listening end: takes connections, as many as are allowed, and lets none keep the others waiting."""
+"""The listening end: accepts connections up to a limit, and lets none of them block the others."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from pynetdicom.transport import AssociationServer, RequestHandler
 from stereoreg_ros.reception.bounded_socket import BoundedSocket, Limits, describe
 from stereoreg_ros.reception.ending_state_machine import EndingStateMachine
 
-# Connections beyond the allowed associations: those that have not asked for one yet, or learn why they get none.
-# Each takes two threads, which look for something to do a thousand times a second.
+# Connections beyond the allowed associations: those that have not requested one yet, or are being rejected.
+# Each takes two threads, which poll a thousand times a second.
 SPARE_CONNECTIONS: Final = 8
-# Rejected for now, by the provider's presentation layer: PS3.8 9.3.4.
+# Rejected (transient) by the provider's presentation layer: PS3.8 9.3.4.
 _LOCAL_LIMIT_EXCEEDED: Final = (2, 3, 2)
 _ABORTED_BY_USER: Final = 0
 _POLL_S: Final = 0.1
@@ -32,23 +32,23 @@ _LOG = logging.getLogger(__name__)
 
 
 class _Connection(RequestHandler):
-    """Makes a connection's association read through a BoundedSocket."""
+    """Has a connection's association read through a BoundedSocket."""
 
     server: BoundedServer
 
     def _create_association(self) -> Association:
         association = super()._create_association()
-        # The socket in place announces the connection anew; it is to be heard of once.
+        # A new socket announces the connection a second time; drop one of the two events.
         association.dul.event_queue.get_nowait()
         association.dul.socket = BoundedSocket(association, self.request, self.server.limits)
         association.dul.state_machine = EndingStateMachine(association.dul)
-        # A thread that waits for a client must not keep the process from ending.
+        # A thread that waits for a client must not keep the process alive.
         association.dul.daemon = True
         return association
 
 
 class BoundedServer(AssociationServer):
-    """pynetdicom's server, in a thread of its own, with a bound on connections; for AE.make_server.
+    """pynetdicom's server, in a thread of its own, with a limit on connections; for AE.make_server.
 
     limits: see Limits. The other arguments are those of AssociationServer.
     """
@@ -73,11 +73,11 @@ class BoundedServer(AssociationServer):
         self._thread = threading.Thread(target=self.serve_forever, args=(_POLL_S,), name="dicom-listener", daemon=True)
 
     def start(self) -> None:
-        """Begin to take connections."""
+        """Start to accept connections."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Take no more connections and abort those that are open; takes half a second at most."""
+        """Accept no more connections and abort the open ones; takes half a second at most."""
         # Not this class's shutdown(), which expects the server to have been started by the AE.
         super(AssociationServer, self).shutdown()
         self.server_close()
@@ -86,12 +86,12 @@ class BoundedServer(AssociationServer):
             association.acse.send_abort(_ABORTED_BY_USER)
         end_s = time.monotonic() + _FAREWELL_S
         for association in open_associations:
-            # The rest have nobody who would hear of it.
+            # The others have no client that waits for the abort.
             if association.is_established:
                 association.dul.join(max(end_s - time.monotonic(), 0.0))
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """The next connection. TLS is agreed upon when it is first read: here it would keep all others waiting."""
+        """The next connection. Its TLS handshake happens at the first read: here it would block all others."""
         assert self.socket is not None
         connection, address = self.socket.accept()
         if self.ssl_context is not None:
@@ -99,14 +99,14 @@ class BoundedServer(AssociationServer):
         return connection, address
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Whether there is room for one more connection; where not, it is closed at once."""
+        """Whether there is room for one more connection; if not, it is closed at once."""
         if len(self.active_associations) < self.limits.max_associations + SPARE_CONNECTIONS:
             return True
         _LOG.warning("connection from %s closed: too many are open", client_address[0])
         return False
 
     def _admit(self, event: Event) -> None:
-        """Reject an association beyond the limit. pynetdicom's own would count connections that ask for none."""
+        """Reject an association beyond the limit. pynetdicom's own limit would count connections without one."""
         with self._admission:
             self._admitted = [one for one in self._admitted if not _is_over(one)]
             if len(self._admitted) < self.limits.max_associations:
@@ -131,10 +131,10 @@ def _note_answer(event: Event) -> None:
 
 
 def _on_close(event: Event) -> None:
-    """Where a connection closes before its association request, its place is free now, not after the timeout."""
+    """Free the place of a connection that closes before its association request now, not after the timeout."""
     if isinstance(event.assoc.dul.socket, BoundedSocket):
         event.assoc.dul.socket.release()
     waiting: queue.Queue[Any] = event.assoc.dul.to_user_queue
     if event.assoc.requestor.primitive is None:
-        # As the wait itself would give at its end.
+        # What the wait itself would return at the timeout.
         waiting.put(None)

@@ -14,7 +14,7 @@ from pynetdicom.transport import AssociationSocket
 if TYPE_CHECKING:
     from pynetdicom.association import Association
 
-# Announced to clients, who then send no longer PDUs. An association request, which it does not bind, is shorter too.
+# Announced to clients, which then send no longer PDUs. An association request, to which it does not apply, is shorter.
 MAX_PDU_BYTES: Final = 2**18
 _PDU_HEADER_BYTES: Final = 6
 _READ_BYTES: Final = 2**16
@@ -24,7 +24,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Limits:
-    """What a client may ask for at most.
+    """The limits for a client.
 
     max_object_bytes: of one object. max_associations: at a time. association_timeout_s: from the connection to the
     association request. network_timeout_s: of silence, and for one PDU to arrive.
@@ -37,14 +37,14 @@ class Limits:
 
     @property
     def max_message_bytes(self) -> int:
-        """An object with its command, and with what small PDUs add to it."""
+        """An object with its command, and the overhead of small PDUs."""
         return self.max_object_bytes + self.max_object_bytes // 64 + MAX_PDU_BYTES
 
 
 class BoundedSocket(AssociationSocket):
-    """Ends an association before what it sends takes more memory, or keeps its thread longer, than the limits allow.
+    """Ends an association before it takes more memory, or occupies its thread longer, than the limits allow.
 
-    pynetdicom itself would wait for ever for the rest of a PDU, and take PDUs of 4 GB and messages of any size.
+    pynetdicom itself would wait forever for the rest of a PDU, and accept PDUs of 4 GB and messages of any size.
     """
 
     def __init__(self, association: Association, client_socket: socket.socket, limits: Limits) -> None:
@@ -54,11 +54,11 @@ class BoundedSocket(AssociationSocket):
         self._unanswered_bytes = 0
 
     def answered(self) -> None:
-        """The client's message has its response: only now may it send the next, and only now is its memory free."""
+        """Note that the client's message has been answered: only now is its memory free, and the next one allowed."""
         self._unanswered_bytes = 0
 
     def release(self) -> None:
-        """Let go of the connection; pynetdicom does not where the client was the first to."""
+        """Close the connection; pynetdicom does not where the client closed it first."""
         self._connection.close()
 
     def recv(self, nr_bytes: int) -> bytearray:
@@ -91,7 +91,7 @@ class BoundedSocket(AssociationSocket):
             if not part:
                 break
             received += part
-        # It holds for the answers too: a client that does not read them is let go.
+        # For the responses too: a client that does not read them is disconnected.
         connection.settimeout(limits.network_timeout_s)
         return received
 
@@ -105,7 +105,7 @@ class BoundedSocket(AssociationSocket):
 
 
 def describe(association: Association) -> str:
-    """Who called, for the log: the AE title, once it is known, and the host."""
+    """The caller, for the log: AE title, once it is known, and host."""
     requestor = association.requestor
     title = str(requestor.primitive.calling_ae_title).strip() if requestor.primitive else "an unknown caller"
     return f"{title!r} at {requestor.address}"

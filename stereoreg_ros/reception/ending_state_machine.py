@@ -1,4 +1,4 @@
-"""The state machine of an association that takes what no standard foresees for its end."""
+"""The state machine of an association, which ends it on a sequence that the standard does not define."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _LOG = logging.getLogger(__name__)
 
 
 class EndingStateMachine(StateMachine):
-    """pynetdicom's, which would end its thread with an error where a client's PDUs come in a meaningless order."""
+    """pynetdicom's own would end its thread with an error where a client's PDUs come in a meaningless order."""
 
     def do_action(self, event: str) -> None:
-        """Take the step that `event` asks for, or end the association."""
+        """Take the step for `event`, or end the association."""
         try:
             super().do_action(event)
         except InvalidEventError as error:

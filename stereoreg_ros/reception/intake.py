@@ -12,13 +12,13 @@ from stereoreg_ros.geometry.slice import SPACING_RANGE_MM
 from stereoreg_ros.reception.kept_objects import KeptObjects
 from stereoreg_ros.reception.slice_queue import QueueFullError, ReceivedSlice, SliceQueue
 
-# Of the storage service, PS3.4 B.2.3.
+# Status codes of the storage service, PS3.4 B.2.3.
 OUT_OF_RESOURCES: Final = 0xA700
 CANNOT_UNDERSTAND: Final = 0xC000
 
 
 class ObjectRefusedError(Exception):
-    """An object that was not taken; status: as a C-STORE response has it; the text is the reason."""
+    """An object that was refused; status: that of the C-STORE response; the text is the reason."""
 
     def __init__(self, status: int, reason: str) -> None:
         super().__init__(reason)
@@ -26,9 +26,9 @@ class ObjectRefusedError(Exception):
 
 
 class Intake:
-    """Takes objects from any thread; `queue` then holds their slices.
+    """Takes objects from any thread and puts their slices into `queue`.
 
-    max_object_bytes: of an object, as it came and unpacked.
+    max_object_bytes: limit for an object, both as it came and unpacked.
     """
 
     def __init__(self, queue: SliceQueue, max_object_bytes: int) -> None:
@@ -38,8 +38,8 @@ class Intake:
     def take(self, name: Path, content: bytes, uid: str = "", kept: KeptObjects | None = None) -> int:
         """Take an object in the form of a DICOM file; returns the number of its slices.
 
-        name: stands for it in reasons. uid: what it was announced as, and must bear. kept: where it is kept, under that
-        UID, before this returns.
+        name: stands for it in reasons. uid: the SOP Instance UID that it was announced with, and must have. kept: where
+        it is kept, under that UID, before this returns.
         Raises ObjectRefusedError; nothing of the object is queued then.
         """
         arrival_s = time.monotonic()
@@ -51,7 +51,7 @@ class Intake:
             frames = read_frames(name, content, self._max_object_bytes, uid)
         except DicomError as error:
             raise ObjectRefusedError(CANNOT_UNDERSTAND, str(error)) from None
-        # What register_node takes: a slice of another spacing would be in the way of all that follow.
+        # The range that register_node accepts.
         low, high = SPACING_RANGE_MM
         for frame in frames:
             scale = frame.header.scale

@@ -15,12 +15,12 @@ _UID: Final = re.compile(r"[0-9]+(\.[0-9]+)*")
 
 
 def is_uid(text: str) -> bool:
-    """Whether the text is a DICOM UID: digits and dots, 64 characters at most. As a file name it leads nowhere else."""
+    """Whether the text is a DICOM UID: digits and dots, 64 characters at most. Safe as a file name."""
     return len(text) <= 64 and _UID.fullmatch(text) is not None
 
 
 class KeptObjects:
-    """The objects in `folder`, each in a file that bears its SOP instance UID."""
+    """The objects in `folder`, each in a file named after its SOP Instance UID."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -47,7 +47,7 @@ class KeptObjects:
         raise AssertionError("count does not end")
 
     def remove_unfinished(self) -> None:
-        """Remove what a crash left half written; nobody was told that it was kept."""
+        """Remove what a crash left half written; it was never acknowledged."""
         remove_unfinished(self._folder)
 
 

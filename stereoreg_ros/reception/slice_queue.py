@@ -1,4 +1,4 @@
-"""Slices on their way from the scanner to whoever publishes them: bounded, in order, none lost."""
+"""Slices on their way from the scanner to the publisher: a bounded queue, in order, without loss."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_BYTES: Final = 2**30
 
 
 class QueueFullError(Exception):
-    """No room for more slices; the text says how many wait."""
+    """No room for more slices; the text says how many are waiting."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class SliceQueue:
 
     @contextmanager
     def room_for(self, slices: Sequence[ReceivedSlice]) -> Iterator[None]:
-        """Keep room for the slices; they join the queue at the end of the block, unless that raises.
+        """Reserve room for the slices; they join the queue at the end of the block, unless it raises.
 
         Raises QueueFullError, before the block, where there is no room for all of them, or the queue is closed.
         """
@@ -52,7 +52,7 @@ class SliceQueue:
                 raise QueueFullError("the receiver is ending")
             taken = len(self._waiting) + self._reserved
             if taken + len(slices) > self._max_slices or self._bytes + size > MAX_BYTES:
-                raise QueueFullError(f"{taken} slices wait already, no room for {len(slices)} more")
+                raise QueueFullError(f"{taken} slices are already waiting, no room for {len(slices)} more")
             self._reserved += len(slices)
             self._bytes += size
         try:
@@ -72,12 +72,12 @@ class SliceQueue:
             return self._waiting[0] if self._waiting else None
 
     def remove_first(self) -> None:
-        """Let go of the slice that `first` gave."""
+        """Remove the slice that `first` returned."""
         with self._lock:
             self._bytes -= _bytes_of(self._waiting.popleft())
 
     def close(self) -> None:
-        """Take no more slices."""
+        """Accept no more slices."""
         with self._lock:
             self._closed = True
 

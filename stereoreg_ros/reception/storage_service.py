@@ -25,12 +25,12 @@ _LOG = logging.getLogger(__name__)
 
 
 class StorageService:
-    """A storage receiver that gives what it is sent to an Intake, and acknowledges what that has taken.
+    """A storage receiver that passes objects to an Intake, and acknowledges those that it has taken.
 
-    address, port: where to listen; port 0: any that is free. ae_title: what clients must call.
+    address, port: where to listen; port 0: any that is free. ae_title: the title that clients must call.
     allowed_callers: AE titles of the clients that are served; none: all.
     tls: None for plain connections. kept: where objects are kept; None: nowhere.
-    Raises OSError where nobody can listen there, ValueError where an AE title is none.
+    Raises OSError where it cannot listen there, ValueError for an invalid AE title.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class StorageService:
         self._entity = entity = AE(ae_title)
         entity.require_called_aet = True
         entity.require_calling_aet = list(allowed_callers)
-        # The server has a bound of its own, and leaves this one out of reach.
+        # The server has a limit of its own, so that this one is never reached.
         entity.maximum_associations = limits.max_associations + SPARE_CONNECTIONS
         entity.maximum_pdu_size = MAX_PDU_BYTES
         entity.acse_timeout = limits.association_timeout_s
@@ -76,7 +76,7 @@ class StorageService:
         return int(self._server.server_address[1])
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Start to serve."""
         self._server.start()
 
     def stop(self) -> None:
@@ -109,7 +109,7 @@ class StorageService:
 def _response(status: int, reason: str) -> Dataset:
     response = Dataset()
     response.Status = status
-    # The element holds few characters, without the separator of values: its file name is known to the client anyway.
+    # The element has few characters and must not contain the separator of values; the client knows the name anyway.
     comment = reason.partition(": ")[2] or reason
     response.ErrorComment = comment.encode("ascii", "replace").decode().replace("\\", "/")[:_MAX_COMMENT_CHARACTERS]
     return response

@@ -1,4 +1,4 @@
-"""Which transfer syntaxes can be read here: some need decoders that may not be installed."""
+"""The transfer syntaxes that can be read here: some need decoders that may not be installed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pydicom
 from pydicom import uid
 from pydicom.uid import UID
 
-# Process 14 with any predictor; pydicom 2 and 3 do not mean the same by the name JPEGLossless.
+# Process 14 with any predictor; the name JPEGLossless differs between pydicom 2 and 3.
 JPEG_LOSSLESS: Final = UID("1.2.840.10008.1.2.4.57")
 _ALWAYS: Final = (
     uid.ExplicitVRLittleEndian,
@@ -30,7 +30,7 @@ _COMPRESSED: Final = (
 
 
 def readable() -> tuple[UID, ...]:
-    """The transfer syntaxes whose pixels can be decoded with what is installed, the plain ones first."""
+    """The transfer syntaxes whose pixels can be decoded with the installed decoders, uncompressed ones first."""
     return (*_ALWAYS, *filter(_has_decoder, _COMPRESSED))
 
 

@@ -15,7 +15,7 @@ from stereoreg_ros.reception.intake import OUT_OF_RESOURCES, Intake, ObjectRefus
 
 _LOG = logging.getLogger(__name__)
 _Version: TypeAlias = tuple[int, int]
-# Neither links nor what is no file is opened, not even where it was put in a file's or folder's place a moment ago.
+# Links and special files are never opened, not even where one has just replaced a file or folder.
 _READ: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
 _ENTER: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY
 
@@ -32,11 +32,11 @@ class _Found:
 
 
 class WatchedFolder:
-    """Looks into `folder` and its subfolders every `period_s` seconds, in a thread of its own.
+    """Scans `folder` and its subfolders every `period_s` seconds, in a thread of its own.
 
-    A file is complete when its size and its time are those of the look before and all of it can be read as DICOM.
-    What lies there at the start is left alone, unless it changes: it may be of any age, and would look new. For the
-    same reason a file that vanishes and returns unchanged, as with a share that is mounted again, stays known.
+    A file is complete when its size and time have not changed since the last scan and all of it can be read as DICOM.
+    Files that are there at the start are left alone, unless they change: they may be of any age, and would look new.
+    For the same reason a file that vanishes and returns unchanged, as on a share that is mounted again, stays known.
     Names that begin with a dot are unfinished files of other programs, and left alone. max_file_bytes: larger files are
     not read. Raises OSError where the folder cannot be listed.
     """
@@ -54,15 +54,15 @@ class WatchedFolder:
         self._thread = threading.Thread(target=self._watch, name="watched-folder", daemon=True)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start to scan."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop scanning."""
         self._ended.set()
 
     def look(self) -> None:
-        """Take what has become complete since the last look, the oldest first."""
+        """Take what has become complete since the last scan, the oldest first."""
         found = sorted(self._files(), key=lambda one: (one.modified_ns, one.path))
         before, self._seen = self._seen, {one.path: one.version for one in found}
         for one in found:
@@ -77,7 +77,7 @@ class WatchedFolder:
             try:
                 self.look()
             except Exception:
-                _LOG.exception("internal error while looking into %s", self._folder)
+                _LOG.exception("internal error while scanning %s", self._folder)
 
     def _files(self) -> Iterator[_Found]:
         for folder, subfolders, names in os.walk(self._folder, followlinks=False):
@@ -92,7 +92,7 @@ class WatchedFolder:
                     yield _Found(path, status.st_size, status.st_mtime_ns)
 
     def _opened(self, path: Path) -> int:
-        """A descriptor of a file in the folder, reached step by step so that no link is followed on the way."""
+        """A descriptor of a file in the folder, opened step by step so that no link on the way is followed."""
         *subfolders, name = path.relative_to(self._folder).parts
         folder = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -105,14 +105,14 @@ class WatchedFolder:
             os.close(folder)
 
     def _take(self, found: _Found) -> bool:
-        """Take a file, or warn that it cannot be used; false where there is no room for it now."""
+        """Take a file, or warn that it cannot be used; false where there is no room for it at present."""
         try:
             if found.size > self._max_file_bytes:
                 raise OSError(f"has {found.size} bytes, expected {self._max_file_bytes} at most")
             with open(self._opened(found.path), "rb") as stream:
                 status = os.fstat(stream.fileno())
                 if not stat.S_ISREG(status.st_mode) or (status.st_size, status.st_mtime_ns) != found.version:
-                    raise OSError("was replaced while it was looked at")
+                    raise OSError("was replaced while it was being read")
                 content = stream.read(found.size)
             slices = self._intake.take(found.path, content)
         except OSError as error:

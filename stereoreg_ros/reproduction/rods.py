@@ -21,7 +21,7 @@ def _frame(name: str, ends_mm: ArrayLike) -> Frame:
 
 
 # Between the lower and the upper face of a cube of 60 mm, the lower one at z = 0, since the paper's slices lie at
-# z = 30 +- 10. Figures with n lines use the first n. Selected, as the report tells: a to d by a search for a small
+# z = 30 +- 10. Figures with n lines use the first n. Selected, as the report says: a to d by a search for a small
 # Cramer-Rao bound; e to h among random ones for a small bound, Newton-Raphson below the paper's figures and closed
 # forms near them. The layouts drawn without selection did worse.
 EIGHT_RODS: Final = _frame(

@@ -68,12 +68,12 @@ def centred_pose(
 
 
 def passage(frame: Frame, middle: Pose, step_mm: float, *, drift_deg: float = 2.0, min_rods: int = 3) -> Iterator[Pose]:
-    """Poses slice_from_frame of the frame on its way through the slice along z, for ever to and fro.
+    """Poses slice_from_frame of the frame on its way through the slice along z, endlessly to and fro.
 
     middle: slice_from_frame half way. From one slice to the next the frame moves by `step_mm` and its tilt drifts
     within `drift_deg`. The passage turns back where fewer than `min_rods` rods would reach the slice, so that some
     rods have left it towards both ends.
-    Raises ValueError on a step that is not positive, or where no stretch has so many rods.
+    Raises ValueError on a step that is not positive, or where no stretch has that many rods.
     """
     if not step_mm > 0:
         raise ValueError(f"step_mm is {step_mm}, expected a positive number of mm")

@@ -47,7 +47,7 @@ class SpotSet:
 def random_spot_set(
     rng: np.random.Generator, frame: Frame, settings: SpotSetSettings, nominal: Pose | None = None
 ) -> SpotSet:
-    """A random pose with at least `visible_rods` rods through the slice, of which so many are seen; the same for the
+    """A random pose with at least `visible_rods` rods through the slice, of which that many are seen; the same for the
     same generator state. nominal: see `random_pose`.
     """
     # Spots have no extent here: a thin slice keeps every rod whose axis is cut.

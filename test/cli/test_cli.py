@@ -130,7 +130,7 @@ def test_worst_case_on_demand(stereoreg, cube_slice, tmp_path):
     assert smaller[WORST_KEYS[0]] == pytest.approx(0.4 * bounds[0], rel=0.1)
     line = stereoreg(*told, cube_slice)[1].splitlines()[1]
     assert f"target off by at most {bounds[0]:.2f} mm" in line
-    assert "no bound of the target's error for spots 9 pixel off" in stereoreg(*told[:-1], 9, cube_slice)[1]
+    assert "no bound on the target error for spots 9 pixel off" in stereoreg(*told[:-1], 9, cube_slice)[1]
     (beyond,) = objects(stereoreg(*told[:-1], 9, "--json", cube_slice)[1])
     assert [beyond[key] for key in WORST_KEYS] == [None] * 3
     truth = SCANNER_FROM_SLICE @ SLICE_FROM_FRAME
@@ -372,7 +372,7 @@ def test_overlay_folder_that_cannot_be(stereoreg, cube_slice, tmp_path):
     taken.write_text("a file")
     code, output, errors = stereoreg("register", "--frame", "cube6", "--overlay", taken, cube_slice)
     assert (code, output) == (2, "")
-    assert f"--overlay: {taken} cannot be made a folder" in errors
+    assert f"--overlay: {taken} cannot be created" in errors
 
 
 def test_version_and_help(stereoreg):

@@ -360,7 +360,7 @@ class TestDesign:
         assert self.call(monkeypatch, tmp_path, *self.FLAGS, "--height", "0") == 0
         wish, *others = self.asked
         lines = [line[2:] for line in (tmp_path / "mine.yaml").read_text().splitlines() if line.startswith("# ")]
-        assert lines[0].startswith("6 rods; 95 % target error 0.250 mm over the slices")
+        assert lines[0].startswith("6 rods; 95 % target error 0.250 mm over the requested slices")
         assert "0 of 20 spot sets ambiguous" in lines[0]
         begin = next(number for number, line in enumerate(lines) if line.startswith("stereoreg design"))
         end = next(number for number, line in enumerate(lines) if line.startswith("Axes"))
@@ -383,7 +383,7 @@ class TestDesign:
     ) -> None:
         assert self.call(monkeypatch, tmp_path, *self.FLAGS, interrupted=True) == 130
         assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
-        assert "mine.yaml is the best layout so far, not tried for ambiguous poses" in capsys.readouterr().err
+        assert "mine.yaml is the best layout so far, not checked for ambiguous poses" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("raised", "code"), [(OSError(28, "No space left on device"), 1), (KeyboardInterrupt(), 130)])

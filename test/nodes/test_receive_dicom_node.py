@@ -269,7 +269,7 @@ def test_a_full_queue_refuses_and_loses_nothing(client, tmp_path):
         port = port_of(process, client)
         responses = send(port, *paths)
         assert [one.Status for one in responses] == [SUCCESS] * 3 + [OUT_OF_RESOURCES] * 2
-        assert responses[-1].ErrorComment == "3 slices wait already, no room for 1 more"
+        assert responses[-1].ErrorComment == "3 slices are already waiting, no room for 1 more"
         received = Received(process, client)
         received.wait(3)
         assert [one.Status for one in send(port, *paths[3:])] == [SUCCESS] * 2

@@ -125,8 +125,8 @@ def test_enhanced_ct_image_that_lacks_a_group(tmp_path, received, keyword, comme
 @pytest.mark.parametrize(
     ("elements", "words"),
     [
-        ({"NumberOfFrames": 3}, "the frames of the Enhanced CT image cannot be told apart"),
-        ({"PixelData": STORED.tobytes()}, "the frames of the Enhanced CT image cannot be told apart"),
+        ({"NumberOfFrames": 3}, "the frames of the Enhanced CT image cannot be separated"),
+        ({"PixelData": STORED.tobytes()}, "the frames of the Enhanced CT image cannot be separated"),
         ({"VolumetricProperties": "DISTORTED"}, "Volumetric Properties (0008,9206) is 'DISTORTED'"),
         ({"NumberOfFrames": 100_000}, "its pixels take 448000000 bytes"),
     ],

@@ -40,7 +40,7 @@ def test_first_in_first_out(slices):
 def test_all_of_an_object_or_none_of_it(slices):
     queue = SliceQueue(4)
     put(queue, slices[:3])
-    with pytest.raises(QueueFullError, match="3 slices wait already, no room for 2 more"):
+    with pytest.raises(QueueFullError, match="3 slices are already waiting, no room for 2 more"):
         put(queue, slices[3:5])
     assert len(queue) == 3
     put(queue, slices[3:4])
@@ -52,7 +52,7 @@ def test_room_is_kept_while_an_object_is_stored_and_given_back_where_that_fails(
 
     def store() -> None:
         assert queue.first() is None
-        with pytest.raises(QueueFullError, match="2 slices wait already"):
+        with pytest.raises(QueueFullError, match="2 slices are already waiting"):
             put(queue, slices[2:3])
         raise OSError("disk")
 
@@ -67,7 +67,7 @@ def test_pixels_are_bounded_as_well(slices, monkeypatch):
     monkeypatch.setattr(slice_queue, "MAX_BYTES", 3 * PIXELS.size * np.float32().nbytes)
     queue = SliceQueue(100)
     put(queue, slices[:3])
-    with pytest.raises(QueueFullError, match="3 slices wait already"):
+    with pytest.raises(QueueFullError, match="3 slices are already waiting"):
         put(queue, slices[3:4])
     queue.remove_first()
     put(queue, slices[3:4])

@@ -49,7 +49,7 @@ _SAME_PX = 1.5
 
 
 def compare(beside: Beside, slices: int, seed: int = 0) -> Found:
-    """What a fixed threshold and `auto` find in so many slices."""
+    """What a fixed threshold and `auto` find in a number of slices."""
     rng = np.random.default_rng(seed)
     counts = np.zeros(6, dtype=int)
     for _ in range(slices):

@@ -18,8 +18,8 @@ THRESHOLDS = (0.0, -0.5, -1.0, -1.5, -2.0, -3.0, -4.0)
 class Clutter:
     """Sets of nothing but false spots, uniform over a square of `side_mm`, from `fewest` to `most` of them.
 
-    noise_px: that the matcher is told; max_log10: how many false alarms it may let pass, as log10; tolerance_mm,
-    scale_tolerance: of the frame and the scale, as the matcher is told.
+    noise_px: stated to the matcher; max_log10: how many false alarms it may let pass, as log10; tolerance_mm,
+    scale_tolerance: of the frame and the scale, as stated to the matcher.
     """
 
     frame: str
@@ -43,7 +43,7 @@ class Count:
 
 
 def count(clutter: Clutter, sets: int, seed: int) -> Count:
-    """Draw so many sets and register them."""
+    """Draw a number of sets and register them."""
     cv2.setNumThreads(1)
     rng = np.random.default_rng(seed)
     frame, scale = load_frame(clutter.frame), ScannerSettings().scale

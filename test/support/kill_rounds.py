@@ -254,9 +254,9 @@ class KillRounds:
             )
         of_stamp = self._of_stamp(stamp)
         if of_stamp is not None and of_stamp is not known:
-            self.tally.faults.append(f"a pose of slice {known.number} bears the stamp of slice {of_stamp.number}")
+            self.tally.faults.append(f"a pose of slice {known.number} has the stamp of slice {of_stamp.number}")
         if of_stamp is None and not self._was_played(stamp):
-            self.tally.faults.append(f"a pose of slice {known.number} bears a stamp at which no slice came")
+            self.tally.faults.append(f"a pose of slice {known.number} has a stamp at which no slice came")
 
     def _judge_status(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -35,7 +35,7 @@ from support.real_scenes import (
     zframe_scenes,
 )
 
-# A pose is wrong where it is off by more than its row allows and by more than so many times the stated 95 % radius.
+# A pose is wrong where it is off by more than its row allows and by more than this many times the stated 95 % radius.
 BEYOND = 2.0
 _INSIDE = (0.93, 0.97)
 # Fewer or more errors than this within their radius are as unlikely as this if the share is in between.
@@ -154,7 +154,7 @@ def step_share(attempts: Sequence[Attempt]) -> float:
 def missed_targets(attempts: Sequence[Attempt], target: Target) -> tuple[str, ...]:
     """What a row does not reach, in words.
 
-    A share inside is missed where a true one between 93 and 97 % would hardly bring it in so many independent errors.
+    A share inside is missed where a true one between 93 and 97 % would hardly bring it in this many independent errors.
     Errors that slices have in common, such as of a rod that is off its place, make the share vary more than that.
     """
     accepted = [one for one in attempts if one.accepted]
@@ -184,7 +184,7 @@ def missed_targets(attempts: Sequence[Attempt], target: Target) -> tuple[str, ..
 
 
 def run(row: Row, most: int | None = None) -> Figures:
-    """Register the scenes of a row; most: of more than so many only some, always the same."""
+    """Register the scenes of a row; most: of more scenes only this many, always the same ones."""
     start = time.perf_counter()
     try:
         scenes = list(row.scenes())
@@ -193,7 +193,7 @@ def run(row: Row, most: int | None = None) -> Figures:
     except RuntimeError as nothing:
         return Figures(row.name, (), time.perf_counter() - start, missed=(str(nothing),))
     if most is not None and len(scenes) > most:
-        # Drawn, as every so-many-th may always be the same rod.
+        # Drawn at random, as every n-th may always be the same rod.
         chosen = np.random.default_rng(0).choice(len(scenes), most, replace=False)
         scenes = [scenes[k] for k in sorted(chosen)]
     attempts = tuple(
@@ -236,14 +236,14 @@ def _catphan() -> Iterable[Row]:
         for threshold in (300.0, AUTO):
             free = RegistrationOptions(threshold=threshold)
             prior = RegistrationOptions(threshold=threshold, max_rotation_deg=PRIOR_DEG)
-            for told, part, options, target in (
+            for prior_or_not, part, options, target in (
                 ("prior", "middle", prior, Target(accepted=0.95)),
                 ("prior", "end", prior, Target(all_inside=True)),
                 ("prior", "others", prior, Target(most_accepted=0.0)),
                 ("no prior", "module", free, Target()),
                 ("no prior", "others", free, Target(most_accepted=0.0)),
             ):
-                name = f"catphan {title}/{_named(threshold)}/{told}/{part}"
+                name = f"catphan {title}/{_named(threshold)}/{prior_or_not}/{part}"
                 quick = title == "second" and (part == "middle" or (part != "others" and threshold != AUTO))
                 yield Row(name, partial(catphan_scenes, series, options, part), target, quick)
 

@@ -216,8 +216,8 @@ def pose_at_rest(poses: Sequence[Pose]) -> Pose:
 def _at_rest(folder: Path, frame_name: str, options: RegistrationOptions, first: int, last: int) -> Pose:
     """From the slices first to last (not included) of a series, registered with the orientation known."""
     frame = load_frame(frame_name)
-    told = replace(options, max_rotation_deg=PRIOR_DEG, nominal_orientation=(0.0, 0.0, 0.0, 1.0))
-    results = [register_slice(one, frame, told) for _, one in series_at(folder)[first:last]]
+    known = replace(options, max_rotation_deg=PRIOR_DEG, nominal_orientation=(0.0, 0.0, 0.0, 1.0))
+    results = [register_slice(one, frame, known) for _, one in series_at(folder)[first:last]]
     poses = [result.scanner_from_frame for result in results if result]
     if len(poses) < 3:
         reasons = ", ".join(sorted({result.reason for result in results if not result}))
@@ -319,8 +319,8 @@ def zframe_scenes(folder: Path, options: RegistrationOptions, row: str) -> Itera
         elif row.startswith("turned"):
             for turn, quaternion in turned_orientations().items():
                 if (turn == ZFRAME_SYMMETRY) == ("onto itself" in row):
-                    told = replace(options, nominal_orientation=quaternion)
-                    cases[f"{name} {turn}"] = partial(register_slice, ct_slice, frame, told)
+                    turned = replace(options, nominal_orientation=quaternion)
+                    cases[f"{name} {turn}"] = partial(register_slice, ct_slice, frame, turned)
         else:
             cases[name] = partial(register_slice, ct_slice, frame, options)
         for what, register in cases.items():

@@ -17,7 +17,7 @@ _POSES = 12
 
 
 def well_conditioned_frame(rods: int, layouts: int = 60, seed: int = 0) -> Frame:
-    """The best of `layouts` random ones: so many rods from the lower to the upper face of a cube of 60 mm.
+    """The best of `layouts` random ones: `rods` rods from the lower to the upper face of a cube of 60 mm.
 
     Judged by the largest standard deviation of a point 100 mm from the origin over a dozen random poses, 1 pixel noise.
     """

@@ -38,7 +38,7 @@ class Received:
 
 @contextmanager
 def receiver(client: RosClient, **parameters: Any):
-    """The receiver at a free port with nobody to be told, unless `parameters` say otherwise."""
+    """The receiver at a free port, not waiting for a register_node, unless `parameters` say otherwise."""
     with receiving_process(**parameters) as process:
         yield Received(process, client)
 
@@ -71,7 +71,7 @@ def hung_up(connection) -> bool:
 
 
 def play(path: Path, *remaps: str, **parameters: Any):
-    """The player for `path` with 50 slices per second and nobody to be told, unless `parameters` say otherwise."""
+    """The player for `path` with 50 slices per second and no register_node, unless `parameters` say otherwise."""
     values = {"path": str(path), "rate": 50.0, "register_node": "", **parameters}
     # JSON is YAML, which is what values on the command line are.
     arguments = [f"{name}:={json.dumps(value)}" for name, value in values.items()]

@@ -69,7 +69,7 @@ class Row:
 
 
 def measure(case: Case, trials: int, seed: int = 0) -> Row:
-    """Draw so many slices with one rod each and find it; wrong: slices with no spot or more than one."""
+    """Draw `trials` slices with one rod each and find it; wrong: slices with no spot or more than one."""
     rng = np.random.default_rng(seed)
     scale = PixelScale(*case.spacing_mm)
     options = RegistrationOptions(threshold=case.threshold)

@@ -22,7 +22,7 @@ from support.rod_layouts import best_subset, well_conditioned_frame
 from support.worst_cases import WorstCaseCount
 
 _BATCH = 250
-# The ball holds 95 % of the errors, give or take so many, of spot sets and of rendered slices.
+# The ball holds 95 % of the errors, within this share, for spot sets and for rendered slices.
 _SPOTS_SLACK, _RENDERED_SLACK = 0.01, 0.02
 # Standard errors of the measured scale, mm/pixel, and their correlation, where a case has them.
 _PERFECT = RegistrationOptions(frame_tolerance_mm=0.0, scale_tolerance=0.0, max_target_error_mm=1000.0)
@@ -34,8 +34,8 @@ class Case:
     """A class of slices with known poses.
 
     frame: name of a shipped frame, or empty for one of `rods` generated rods; of a shipped one the best subset of
-    so many. noise_px: of each coordinate, normal; mixed: each spot has a covariance of its own instead, of 0.05 to
-    0.3 pixel in two directions; with_scale: the pixel scale that is told is off, as its covariance says; rendered: the
+    that many. noise_px: of each coordinate, normal; mixed: each spot has a covariance of its own instead, of 0.05 to
+    0.3 pixel in two directions; with_scale: the stated pixel scale is off, as its covariance says; rendered: the
     spots are found in slices drawn by the simulated scanner; max_rotation_deg: how far from upright the frame is known
     to stand. Of four rods the matcher finds nearly all poses, but not all, and the twin of one that it has missed may
     be taken for it where nothing is known. image_noise_hu: of the rendered slices, as thin slices have it.
@@ -97,7 +97,7 @@ _TIGHT = 0.9
 
 
 def measure_spot_sets(case: Case, sets: int, seed: int) -> PoseStatistics:
-    """Register so many spot sets at random poses."""
+    """Register `sets` spot sets at random poses."""
     rng = np.random.default_rng(seed)
     frame, scanner = case.make_frame(), ScannerSettings()
     true_scale, area_mm2 = scanner.scale, float(np.prod(scanner.size_mm))
@@ -108,10 +108,10 @@ def measure_spot_sets(case: Case, sets: int, seed: int) -> PoseStatistics:
     statistics = PoseStatistics()
     for _ in range(sets):
         pose = random_pose(rng, frame, scanner)
-        told, scale_covariance = true_scale, None
+        stated, scale_covariance = true_scale, None
         if case.with_scale:
             off = rng.multivariate_normal(np.zeros(2), _SCALE_COVARIANCE)
-            told, scale_covariance = PixelScale(true_scale.sx + off[0], true_scale.sy + off[1]), _SCALE_COVARIANCE
+            stated, scale_covariance = PixelScale(true_scale.sx + off[0], true_scale.sy + off[1]), _SCALE_COVARIANCE
         covariances = (
             _mixed(rng, len(frame)) if case.mixed else np.tile(case.noise_px**2 * np.eye(2), (len(frame), 1, 1))
         )
@@ -120,7 +120,7 @@ def measure_spot_sets(case: Case, sets: int, seed: int) -> PoseStatistics:
         result = register_spots(
             spots_px,
             frame,
-            told,
+            stated,
             options,
             slice_area_mm2=area_mm2,
             covariances_px2=covariances,
@@ -131,7 +131,7 @@ def measure_spot_sets(case: Case, sets: int, seed: int) -> PoseStatistics:
 
 
 def measure_rendered(case: Case, slices: int, seed: int) -> PoseStatistics:
-    """Find and register so many rendered slices at random poses."""
+    """Find and register `slices` rendered slices at random poses."""
     rng = np.random.default_rng(seed)
     frame, scanner = case.make_frame(), ScannerSettings(shape=(384, 384), noise_hu=case.image_noise_hu)
     # Far below what the spots' own covariances are, which is what is measured here.
@@ -153,7 +153,7 @@ def _mixed(rng: np.random.Generator, count: int) -> Array:
 
 
 def measure(case: Case, count: int, seed: int, workers: int = 1) -> PoseStatistics:
-    """The statistics of so many slices, in batches over several processes; the same whatever their number."""
+    """The statistics of `count` slices, in batches over several processes; independent of the number of processes."""
     run = partial(measure_rendered if case.rendered else measure_spot_sets, case)
     sizes = [min(_BATCH, count - start) for start in range(0, count, _BATCH)]
     seeds = [1_000_003 * seed + number for number in range(len(sizes))]

@@ -38,7 +38,7 @@ class WorstCaseCount:
 
 
 def count_worst_cases(frame: Frame, max_error_px: float, trials: int, seed: int) -> WorstCaseCount:
-    """Try so many errors of the spots at random poses, a thousand at each; half of them at corners of the box."""
+    """Try `trials` errors of the spots at random poses, a thousand at each; half of them at corners of the box."""
     rng, scanner, n = np.random.default_rng(seed), ScannerSettings(), len(frame)
     unproven = exceeded = tried = scenes = 0
     nearest, reached = 0.0, []
