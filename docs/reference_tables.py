@@ -1,4 +1,4 @@
-"""Directives that generate the reference from the code: parameters, topics, services, reasons, keys, commands.
+"""Directives that generate the reference from the code: parameters, topics, services, reasons, keys, commands, imports.
 
 For a name without a description in the code, the meaning is taken from the README or from the lines of the directive. A
 name without a meaning, or a meaning without a name, is a warning, and warnings fail the build.
@@ -6,6 +6,7 @@ name without a meaning, or a meaning without a name, is a warning, and warnings 
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,7 +32,8 @@ from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings
 from stereoreg_ros.nodes.scanner.simulate_node import SimulationSettings
 from stereoreg_ros.result import REASONS, diagnostics
 
-README = Path(__file__).parent.parent / "README.md"
+REPOSITORY = Path(__file__).parents[1]
+README = REPOSITORY / "README.md"
 PARAMETERS: dict[str, tuple[Entry, ...]] = {
     "register_node": parameters.ENTRIES,
     "simulate_node": entries_of(SimulationSettings),
@@ -167,6 +169,23 @@ class CommandHelp(SphinxDirective):
         return [nodes.literal_block(said.getvalue(), said.getvalue(), language="text")]
 
 
+class ImportTable(_Table):
+    """Which room may import which, from the test that enforces it."""
+
+    def run(self) -> list[nodes.Node]:
+        test = REPOSITORY / "test" / "project" / "test_architecture.py"
+        (allowed,) = [
+            ast.literal_eval(one.value)
+            for one in ast.parse(test.read_text(encoding="utf-8")).body
+            if isinstance(one, ast.AnnAssign) and one.value is not None and ast.unparse(one.target) == "MAY_IMPORT"
+        ]
+        rows = [
+            (f"`{room}`", ", ".join(f"`{other}`" for other in sorted(others)) or "nothing of the package")
+            for room, others in allowed.items()
+        ]
+        return self.table(("room", "may import"), rows)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.add_directive("parameters", ParameterTable)
@@ -174,4 +193,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("reasons", ReasonTable)
     app.add_directive("diagnostic-keys", DiagnosticKeyTable)
     app.add_directive("command-help", CommandHelp)
+    app.add_directive("imports", ImportTable)
     return {"parallel_read_safe": False}
