@@ -1,4 +1,4 @@
-"""The site that `make docs` builds from these pages."""
+"""Configuration of the site that `make docs` builds from these pages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ myst_heading_anchors = 3
 exclude_patterns = ["examples"]
 html_theme = "alabaster"
 html_theme_options = {
-    "description": "Where is the robot in the CT scanner? One slice tells.",
+    "description": "Where is the robot in the CT scanner? A single slice is enough to find out.",
     "page_width": "1100px",
     "fixed_sidebar": True,
 }

@@ -1,11 +1,12 @@
-"""Directives that make the reference from the code: parameters, topics, services, reasons, diagnostic keys, commands.
+"""Directives that generate the reference from the code: parameters, topics, services, reasons, keys, commands, imports.
 
-What a name means that bears no description in the code is taken from the README, or from the directive's own lines. A
-name without a meaning, or a meaning without its name, is a warning, and warnings fail the build.
+For a name without a description in the code, the meaning is taken from the README or from the lines of the directive. A
+name without a meaning, or a meaning without a name, is a warning, and warnings fail the build.
 """
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,19 +32,20 @@ from stereoreg_ros.nodes.scanner.reception_parameters import ReceptionSettings
 from stereoreg_ros.nodes.scanner.simulate_node import SimulationSettings
 from stereoreg_ros.result import REASONS, diagnostics
 
-README = Path(__file__).parent.parent / "README.md"
+REPOSITORY = Path(__file__).parents[1]
+README = REPOSITORY / "README.md"
 PARAMETERS: dict[str, tuple[Entry, ...]] = {
     "register_node": parameters.ENTRIES,
     "simulate_node": entries_of(SimulationSettings),
     "play_dicom_node": play_dicom_node.ENTRIES,
     "receive_dicom_node": entries_of(ReceptionSettings),
 }
-# What every node of ROS has.
+# Topics and services that every ROS node has.
 _OF_ROS = re.compile(r"/rosout|/parameter_events|.*/(get|set|list|describe)_parameter\w*|.*/get_type_description")
 
 
 class _Table(SphinxDirective):
-    """A directive that stands for a table."""
+    """A directive that produces a table."""
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[nodes.Node]:
         lines = [head, ["---"] * len(head), *rows]
@@ -58,7 +60,7 @@ class _Table(SphinxDirective):
 
 
 class ParameterTable(_Table):
-    """The parameters of the node named, from the table that the node declares them from."""
+    """The parameters of one node, from the table from which the node declares them."""
 
     required_arguments: ClassVar[int] = 1
 
@@ -83,10 +85,10 @@ def _allowed(entry: Entry) -> str:
 
 
 class InterfaceTable(_Table):
-    """Topics and services of a register_node that is started for this; their meanings from the README's table."""
+    """Topics and services of a register_node started for this purpose; their meanings come from the README's table."""
 
     def run(self) -> list[nodes.Node]:
-        # Nobody on the network is to meet it.
+        # Keep it invisible to others on the network.
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
         rclpy.init(args=["--ros-args", "--log-level", "warn"])
         node = RegisterNode()
@@ -98,7 +100,7 @@ class InterfaceTable(_Table):
         node.destroy_node()
         rclpy.shutdown()
         ours = [(kind, _relative(name), _type(of)) for kind, name, of in found if not _OF_ROS.fullmatch(name)]
-        # One row may speak of two.
+        # One row may describe two names.
         shown = {name: row[3] for row in _readme_rows(4) for name in row[1].strip("`").split("`, `")}
         self.check((name for _, name, _ in ours), shown)
         rows = [(kind, f"`{name}`", of, _of_this_site(shown.get(name, ""))) for kind, name, of in ours]
@@ -106,7 +108,7 @@ class InterfaceTable(_Table):
 
 
 def _relative(name: str) -> str:
-    """As it is written in the README: relative to the namespace or the node."""
+    """The name as the README writes it: relative to the namespace or the node."""
     if name.startswith("/register_node/"):
         return name.replace("/register_node/", "~/")
     return name if name == "/diagnostics" else name.removeprefix("/")
@@ -117,7 +119,7 @@ def _type(of: type) -> str:
 
 
 class ReasonTable(_Table):
-    """The reasons of a refusal; their meanings from the README's table."""
+    """The reasons of a refusal; their meanings come from the README's table."""
 
     def run(self) -> list[nodes.Node]:
         texts = {row[0].strip("`"): [_of_this_site(text) for text in row[1:]] for row in _readme_rows(3)}
@@ -128,7 +130,7 @@ class ReasonTable(_Table):
 
 
 def _readme_rows(columns: int) -> list[list[str]]:
-    """The rows of all tables of the README with so many columns, heads left out."""
+    """The rows of all tables of the README with this number of columns, without the header rows."""
     lines = README.read_text(encoding="utf-8").splitlines()
     below_head = [
         line for line, next_line in zip(lines, [*lines[1:], ""], strict=True) if "|---|" not in line + next_line
@@ -138,12 +140,12 @@ def _readme_rows(columns: int) -> list[list[str]]:
 
 
 def _of_this_site(text: str) -> str:
-    """Links of the README, as seen from a page of the reference."""
+    """The text with the README's links rewritten for a page of the reference."""
     return text.replace("](docs/", "](../")
 
 
 class DiagnosticKeyTable(_Table):
-    """The diagnostic keys, from a registration; the directive's lines say what they mean: `key: meaning`."""
+    """The diagnostic keys, from a registration; the lines of the directive give their meanings: `key: meaning`."""
 
     has_content: ClassVar[bool] = True
 
@@ -155,7 +157,7 @@ class DiagnosticKeyTable(_Table):
 
 
 class CommandHelp(SphinxDirective):
-    """What `stereoreg ... --help` says."""
+    """The output of `stereoreg ... --help`."""
 
     optional_arguments: ClassVar[int] = 1
 
@@ -167,6 +169,23 @@ class CommandHelp(SphinxDirective):
         return [nodes.literal_block(said.getvalue(), said.getvalue(), language="text")]
 
 
+class ImportTable(_Table):
+    """Which room may import which, from the test that enforces it."""
+
+    def run(self) -> list[nodes.Node]:
+        test = REPOSITORY / "test" / "project" / "test_architecture.py"
+        (allowed,) = [
+            ast.literal_eval(one.value)
+            for one in ast.parse(test.read_text(encoding="utf-8")).body
+            if isinstance(one, ast.AnnAssign) and one.value is not None and ast.unparse(one.target) == "MAY_IMPORT"
+        ]
+        rows = [
+            (f"`{room}`", ", ".join(f"`{other}`" for other in sorted(others)) or "nothing of the package")
+            for room, others in allowed.items()
+        ]
+        return self.table(("room", "may import"), rows)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.add_directive("parameters", ParameterTable)
@@ -174,4 +193,5 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("reasons", ReasonTable)
     app.add_directive("diagnostic-keys", DiagnosticKeyTable)
     app.add_directive("command-help", CommandHelp)
+    app.add_directive("imports", ImportTable)
     return {"parallel_read_safe": False}

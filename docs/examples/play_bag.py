@@ -1,4 +1,4 @@
-"""Plays a bag with slices to whoever listens, where `ros2 bag play` is not at hand."""
+"""Plays a bag of slices to its subscribers, for systems without `ros2 bag play`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEADLINE_S = 30.0
 
 
 def main() -> int:
-    """Play to the end; 1 where nobody listens to a topic of the bag."""
+    """Play to the end; exit status 1 if a topic of the bag has no subscriber."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("bag", type=Path, help="folder of the bag")
     arguments = parser.parse_args()
@@ -36,7 +36,7 @@ def main() -> int:
             deadline = time.monotonic() + DEADLINE_S
             while publisher.get_subscription_count() == 0:
                 if time.monotonic() > deadline:
-                    print(f"nobody listens to {topic}", file=sys.stderr)
+                    print(f"{topic} has no subscriber", file=sys.stderr)
                     return 1
                 rclpy.spin_once(node, timeout_sec=0.1)
         first_ns, begun = bag.start_time, time.monotonic()
@@ -44,8 +44,8 @@ def main() -> int:
             time.sleep(max(0.0, begun + 1e-9 * (at_ns - first_ns) - time.monotonic()))
             publishers[connection.topic].publish(message)
             if at_ns == first_ns:
-                # Before the first image comes, the receiver has to know that slices have poses, and has its pose. That
-                # may take seconds; those that follow keep their distance.
+                # Before the first image arrives, the subscriber must know that slices have poses and must have the
+                # first one. That may take seconds; the messages that follow keep their intervals.
                 waits_since = time.monotonic()
                 publishers[connection.topic].wait_for_all_acked(Duration(seconds=DEADLINE_S))
                 begun += time.monotonic() - waits_since

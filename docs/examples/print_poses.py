@@ -1,4 +1,4 @@
-"""Prints what register_node says about each slice: the pose, or why there is none."""
+"""Prints the answer of register_node to each slice: the pose, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PrintPoses(Node):
 
 
 def main() -> None:
-    """Until interrupted."""
+    """Run until interrupted."""
     rclpy.init()
     try:
         rclpy.spin(PrintPoses())

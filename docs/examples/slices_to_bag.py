@@ -1,4 +1,4 @@
-"""Writes a DICOM series as an MCAP bag: the topics `image` and `slice_pose`, as a scanner would have published them."""
+"""Writes a DICOM series to an MCAP bag: the topics `image` and `slice_pose`, as a scanner would have published them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stereoreg_ros.nodes.common.conversions import image_from_hu, pose_to_messag
 
 
 def main() -> None:
-    """Write the bag, and say what register_node has to be told."""
+    """Write the bag, and print the pixel spacing that register_node needs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("series", type=Path, help="folder with the slices of one DICOM series")
     parser.add_argument("bag", type=Path, help="folder to write; must not exist")
@@ -26,7 +26,7 @@ def main() -> None:
     arguments = parser.parse_args()
     series = read_series(arguments.series)
     if not series.headers[0].has_plane:
-        parser.error(f"{arguments.series} has neither position nor orientation, so that no slice_pose is known")
+        parser.error(f"{arguments.series} has no position and orientation, so slice_pose is unknown")
     types = get_typestore(Stores.ROS2_JAZZY)
     begin_ns = time.time_ns()
     with Writer(arguments.bag, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
