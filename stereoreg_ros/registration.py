@@ -20,8 +20,7 @@ from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale, Slice
 from stereoreg_ros.geometry.spots import SliceSpots
 from stereoreg_ros.judgement import Case, Verdict, judge, unfit
-from stereoreg_ros.matching import MATCHERS
-from stereoreg_ros.matching.by_levels import ByLevels
+from stereoreg_ros.matching import Matchers
 from stereoreg_ros.matching.problem import Problem
 from stereoreg_ros.matching.rivals import Rivals
 from stereoreg_ros.options import RegistrationOptions
@@ -40,13 +39,10 @@ class Registrar:
     for long has its own.
     """
 
-    def __init__(self, frame: Frame) -> None:
+    def __init__(self, frame: Frame, matchers: Matchers | None = None) -> None:
+        """matchers: of an equal frame, to be shared; by default its own."""
         self.frame = frame
-        # Whichever matcher finds a pose, what speaks against it is found by this one.
-        self._by_levels = ByLevels(frame)
-        self._matchers = {
-            name: self._by_levels if matcher is ByLevels else matcher(frame) for name, matcher in MATCHERS.items()
-        }
+        self._matchers = matchers or Matchers(frame)
 
     def register(
         self, spots: SliceSpots, options: RegistrationOptions | None = None, previous: Pose | None = None
@@ -65,7 +61,7 @@ class Registrar:
         found = matcher.match(problem)
         # How weakly a pose is determined matters of the best one: the others are only listed.
         estimates = tuple(estimate(one, problem, spots, rank == 0) for rank, one in enumerate(found.hypotheses))
-        verdict = judge(Case(problem, options, found, estimates, Rivals(problem, found, self._by_levels)))
+        verdict = judge(Case(problem, options, found, estimates, Rivals(problem, found, self._matchers.by_levels)))
         if verdict.reason is not None:
             return refusal(verdict, estimates)
         return Registration(frame, spots, options, estimates[0], verdict.message)
@@ -76,7 +72,7 @@ class Registrar:
         if unfit(self.frame, len(spots), options):
             return None
         problem = Problem.of(spots, self.frame, options)
-        found = self._by_levels.match_most(problem)
+        found = self._matchers.by_levels.match_most(problem)
         return Recognition(spots, options, estimate(found[0], problem, spots, False)) if found else None
 
     def preparation(self, scale: PixelScale, options: RegistrationOptions | None = None) -> Iterator[None]:
@@ -86,12 +82,12 @@ class Registrar:
 
 
 @lru_cache(maxsize=_KEPT_FRAMES)
-def _kept(frame: Frame) -> Registrar:
-    return Registrar(frame)
+def _kept(frame: Frame) -> Matchers:
+    return Matchers(frame)
 
 
 def _registrar_of(frame: Frame | Registrar) -> Registrar:
-    return frame if isinstance(frame, Registrar) else _kept(frame)
+    return frame if isinstance(frame, Registrar) else Registrar(frame, _kept(frame))
 
 
 def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> None:
@@ -102,7 +98,7 @@ def prepare(frame: Frame, scale: PixelScale, options: RegistrationOptions | None
 
 def preparation(frame: Frame, scale: PixelScale, options: RegistrationOptions | None = None) -> Iterator[None]:
     """The same in small steps, for those who have other things to do; what most slices need comes first."""
-    return _kept(frame).preparation(scale, options)
+    return _registrar_of(frame).preparation(scale, options)
 
 
 def register_slice(
@@ -206,7 +202,7 @@ def register_slice_spots(
     spots: SliceSpots, frame: Frame, options: RegistrationOptions | None = None, previous: Pose | None = None
 ) -> Registration | Refusal:
     """Register `frame` from the spots of a slice, whoever found them; previous: see `register_spots`."""
-    return _kept(frame).register(spots, options, previous)
+    return _registrar_of(frame).register(spots, options, previous)
 
 
 def recognise(spots: SliceSpots, frame: Frame, options: RegistrationOptions | None = None) -> Recognition | None:
@@ -215,4 +211,4 @@ def recognise(spots: SliceSpots, frame: Frame, options: RegistrationOptions | No
     It is not judged, and nothing is sought that speaks against it: a pose for those who test it in another way, as the
     calibration does with scales.
     """
-    return _kept(frame).recognise(spots, options)
+    return _registrar_of(frame).recognise(spots, options)

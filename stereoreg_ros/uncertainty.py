@@ -7,8 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaincinv
-from scipy.stats import chi2
+from scipy.special import chdtrc, gammaincinv
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose, skew
@@ -77,7 +76,7 @@ class ScaleMisfit(NamedTuple):
     @property
     def probability(self) -> float:
         """Of as large a fall by the stated errors alone; one where the scale is not judged."""
-        return float(chi2.sf(self.fall, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
+        return float(chdtrc(self.degrees_of_freedom, self.fall)) if self.degrees_of_freedom else 1.0
 
 
 class Whitened(NamedTuple):

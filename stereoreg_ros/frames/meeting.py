@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 
@@ -56,6 +55,8 @@ def meetings(
     slice_from_frame's nominal rotation (3, 3), by default the identity; max_rotation_deg: largest angle between the
     rotation and the nominal one, which limits tilt and turn.
     """
+    from scipy.stats import qmc  # takes 0.4 s, which whoever asks for help need not wait
+
     exponent = max(0, math.ceil(math.log2(count)))
     shares = qmc.Sobol(4, seed=np.random.default_rng(seed)).random_base2(exponent)[:count]
     # Tilts spread over the sphere's cap, so that no direction of the normal is met more often than another.

@@ -31,15 +31,11 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def rotation_exp(rotation_vectors: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians, by their quaternions."""
-    squared = np.einsum("...i,...i->...", rotation_vectors, rotation_vectors)[..., None, None]
-    half = 0.5 * np.sqrt(squared)
-    # The sinc form is exact at and near zero, where dividing by the angle is not.
-    scaled = 0.5 * np.sinc(half[..., 0] / np.pi) * rotation_vectors  # vector part of the quaternion
-    rotations: Array = 2.0 * scaled[..., :, None] * scaled[..., None, :]
-    rotations += 2.0 * np.cos(half) * skew(scaled)
-    np.einsum("...ii->...i", rotations)[...] += np.cos(2.0 * half[..., 0])
-    return rotations
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    if not rotation_vectors.size:
+        return np.empty((*rotation_vectors.shape, 3))
+    rotations: Array = Rotation.from_rotvec(rotation_vectors.reshape(-1, 3)).as_matrix()
+    return rotations.reshape(*rotation_vectors.shape, 3)
 
 
 def rotation_angle(rotations: Array) -> Array:

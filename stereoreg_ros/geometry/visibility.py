@@ -18,15 +18,13 @@ END_SLACK_MM: Final = 1.0
 SURE_MM: Final = 2.0
 
 
-def may_show(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
-    """Whether a slice may show each rod (..., n): between its ends or just beyond, and not along the rod."""
+def may_show(frame: Frame, cuts: Cuts, slack_mm: float = END_SLACK_MM) -> NDArray[np.bool_]:
+    """Whether a slice may show each rod (..., n): between its ends or up to slack_mm beyond, and not along the rod."""
     with np.errstate(invalid="ignore"):
-        may = (cuts.lambdas >= frame.lambda_min - END_SLACK_MM) & (cuts.lambdas <= frame.lambda_max + END_SLACK_MM)
+        may = (cuts.lambdas >= frame.lambda_min - slack_mm) & (cuts.lambdas <= frame.lambda_max + slack_mm)
         return np.asarray(may & (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE))
 
 
 def must_show(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
     """Whether a slice must show each rod (..., n) that is in view: well between its ends, and not along the rod."""
-    with np.errstate(invalid="ignore"):
-        must = (cuts.lambdas >= frame.lambda_min + SURE_MM) & (cuts.lambdas <= frame.lambda_max - SURE_MM)
-        return np.asarray(must & (np.abs(cuts.directions[..., 2]) >= LEAST_COSINE))
+    return may_show(frame, cuts, -SURE_MM)

@@ -30,3 +30,16 @@ class Matcher(Protocol):
 
 # By the names of the option `matcher`.
 MATCHERS: Final[dict[str, Callable[[Frame], Matcher]]] = {"three_line": ByLevels, "maurin2009": Maurin2009}
+
+
+class Matchers:
+    """All matchers of one frame, by their names; `by_levels` is the one that also finds what speaks against a pose."""
+
+    def __init__(self, frame: Frame) -> None:
+        self.by_levels = ByLevels(frame)
+        self._named = {
+            name: self.by_levels if matcher is ByLevels else matcher(frame) for name, matcher in MATCHERS.items()
+        }
+
+    def __getitem__(self, name: str) -> Matcher:
+        return self._named[name]

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.slice import PixelScale
@@ -121,7 +121,7 @@ class ByLevels:
                 for one in distinct([*found], gains)
                 if score(one, gains) > least_score
                 and search.false_alarms(one) <= allowed
-                and one.chi_square <= chi2.isf(IMPLAUSIBLE, 2 * one.inliers - 6)
+                and one.chi_square <= chdtri(2 * one.inliers - 6, IMPLAUSIBLE)
             )
             return next(better, None)
 
@@ -135,7 +135,7 @@ class ByLevels:
             # What the stated errors cannot explain would not be accepted either, and speaks against nothing.
             most_chi_square = min(
                 2 * (level * gains.max() - least_score),
-                float(chi2.isf(IMPLAUSIBLE, 2 * level - 6)),
+                float(chdtri(2 * level - 6, IMPLAUSIBLE)),
                 most_chi_square_of(level, decades_left),
             )
             best = best_of(search.level(level, most_chi_square, []), allowed)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
@@ -26,8 +28,9 @@ from stereoreg_ros.matching.significance import (
 )
 from stereoreg_ros.matching.spots import Spots, whitening_of
 
-# Squared distance in standard deviations, two degrees of freedom, beyond which a spot is not the predicted one: 1e-4.
-GATE = 18.4
+# Squared distance in standard deviations, of two degrees of freedom, beyond which a spot is not the predicted one: once
+# in ten thousand.
+GATE: Final = float(chdtri(2, 1e-4))
 # Probability below which a chi-square is not by the stated errors.
 IMPLAUSIBLE = 0.01
 # Height in chi-square of the ridge between two optima below which they are one valley; and its largest extent, rad.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
@@ -98,7 +98,7 @@ def _best_of(
         refined = refine_matches(free, frame, (rotations, translations), spot_of_line)
         rotations, translations = refined.rotations, refined.translations
     fits = (may_show(frame, refined.cuts) | ~used).all(axis=1) & (
-        refined.chi_square <= chi2.isf(IMPLAUSIBLE, 2 * used.sum(axis=1) - 6)
+        refined.chi_square <= chdtri(2 * used.sum(axis=1) - 6, IMPLAUSIBLE)
     )
     fits &= prior.angles(rotations) <= prior.max_rotation
     rows = np.flatnonzero(fits & refined.converged)

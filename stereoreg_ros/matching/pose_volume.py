@@ -18,12 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array
-from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian
-from stereoreg_ros.geometry.visibility import END_SLACK_MM, LEAST_COSINE
+from stereoreg_ros.geometry.projection import cut, cut_jacobian
+from stereoreg_ros.geometry.visibility import END_SLACK_MM, may_show
 from stereoreg_ros.matching.prior import Near, Prior
 
 _LOG2_PLANES = 14
@@ -76,7 +75,7 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
     """Planes with normals evenly over the sphere and heights evenly over the frame; drawn once."""
     rotations, translations, normals, radius = _planes(frame)
     cuts = cut(frame, rotations, translations)
-    visible = _visible(frame, cuts)
+    visible = may_show(frame, cuts)
     chosen = np.flatnonzero(visible.sum(axis=1) >= rods)
     visible, points = visible[chosen], cuts.points_mm[chosen]
     jacobians = cut_jacobian(cuts.take(chosen), translations[chosen])
@@ -105,7 +104,7 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
 def typical_slices(frame: Frame, rods: int, most: int) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Up to `most` poses slice_from_frame (m, 3, 3), (m, 3) mm in which a slice cuts so many rods; and which (m, n)."""
     rotations, translations, _, _ = _planes(frame)
-    visible = _visible(frame, cut(frame, rotations, translations))
+    visible = may_show(frame, cut(frame, rotations, translations))
     chosen = np.flatnonzero(visible.sum(axis=1) >= rods)[:most]
     return rotations[chosen], translations[chosen], visible[chosen]
 
@@ -117,6 +116,8 @@ def _planes(frame: Frame) -> tuple[Array, Array, Array, float]:
     ends = np.concatenate([frame.starts, frame.ends])
     centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
     radius = float(np.linalg.norm(ends - centre, axis=1).max()) + END_SLACK_MM
+    from scipy.stats import qmc  # takes 0.4 s, which whoever asks for help need not wait
+
     drawn = qmc.Sobol(3, scramble=True, seed=0).random_base2(_LOG2_PLANES)
     z, turn = 2 * drawn[:, 0] - 1, 2 * np.pi * drawn[:, 1]
     across = np.sqrt(1 - z**2)
@@ -126,15 +127,6 @@ def _planes(frame: Frame) -> tuple[Array, Array, Array, float]:
     translations = -(rotations @ centre)
     translations[:, 2] += radius * (2 * drawn[:, 2] - 1)
     return rotations, translations, normals, radius
-
-
-def _visible(frame: Frame, cuts: Cuts) -> NDArray[np.bool_]:
-    """Which rods (p, n) the slices may show."""
-    with np.errstate(invalid="ignore"):
-        low, high = frame.lambda_min - END_SLACK_MM, frame.lambda_max + END_SLACK_MM
-        visible = (cuts.lambdas >= low) & (cuts.lambdas <= high)
-        visible &= np.abs(cuts.directions[..., 2]) >= LEAST_COSINE
-    return np.asarray(visible)
 
 
 def stretch(information: Array, variance_mm2: float) -> Array:
@@ -174,9 +166,6 @@ def _any_rotations(normals: Array) -> Array:
 
 def _volume_near(frame: Frame, rods: int, prior: Prior, near: Near) -> float:
     cuts = cut(frame, prior.rotation, near.translation)
-    with np.errstate(invalid="ignore"):
-        slack = END_SLACK_MM + _NEAR_HEIGHTS * near.reach_mm / 2
-        visible = (cuts.lambdas >= frame.lambda_min - slack) & (cuts.lambdas <= frame.lambda_max + slack)
-        visible &= np.abs(cuts.directions[:, 2]) >= LEAST_COSINE
+    visible = may_show(frame, cuts, END_SLACK_MM + _NEAR_HEIGHTS * near.reach_mm / 2)
     room = math.pi * near.reach_mm**2 * _NEAR_HEIGHTS * near.reach_mm
     return comb(int(visible.sum()), rods) * room * 4 / 3 * math.pi * prior.max_rotation**3

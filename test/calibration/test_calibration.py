@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoreg_ros.calibration import judgement
+from stereoreg_ros.calibration import measured
 from stereoreg_ros.calibration.calibrate import Calibration, CalibrationRefusal, calibrate
 from stereoreg_ros.calibration.series import scale_of_series
 from stereoreg_ros.geometry.frame import Frame
@@ -348,7 +348,7 @@ class TestRefused:
 
         best = calibrate(taken, cube, TRUE, OPTIONS)
         assert isinstance(best, Calibration)
-        monkeypatch.setattr(judgement, "calibrate_tolerantly", ended_elsewhere)
+        monkeypatch.setattr(measured, "calibrate_tolerantly", ended_elsewhere)
         message = self.refusal(taken, cube, best.scale, OPTIONS).message
         assert "the slices fit (" in message
         assert "better than (" in message

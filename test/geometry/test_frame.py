@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stereoreg_ros.geometry.frame import Frame
+from stereoreg_ros.geometry.frame_file import load_frame
 from stereoreg_ros.geometry.pose import Pose
 from stereoreg_ros.geometry.projection import cut
 from support.frames import random_frame, random_slice_from_frame
@@ -125,3 +126,30 @@ def test_a_mirrored_frame_is_cut_at_the_same_points() -> None:
 def test_what_is_no_frame(changes: dict[str, Any], told: str) -> None:
     with np.errstate(invalid="ignore"), pytest.raises(ValueError, match=told):
         frame_with(**changes)
+
+
+def test_frames_that_say_the_same_are_equal() -> None:
+    """So that a frame which is loaded again finds its tables."""
+    one, again = load_frame("cube6"), load_frame("cube6")
+    assert one is not again
+    assert one == again
+    assert hash(one) == hash(again)
+    assert one != "cube6"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "another"},
+        {"line_names": tuple("bacdef")},
+        {"starts": np.add(load_frame("cube6").starts, [0.0, 0.0, 1e-9])},
+        {"ends": np.add(load_frame("cube6").ends, [0.0, 0.0, 1e-9])},
+        {"diameters": np.full(6, 1.5)},
+        {"tolerances_mm": np.full(6, 0.1)},
+        {"orientation_required": True},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_frames_that_differ_in_anything_are_not_equal(change: dict[str, Any]) -> None:
+    frame = load_frame("cube6")
+    assert replace(frame, **change) != frame

@@ -78,7 +78,7 @@ def test_the_node_goes_on_preparing_while_no_slice_comes(no_tables, monkeypatch)
     monkeypatch.setattr(register_node, "_PREPARE_AT_ONCE_S", 0.0)
     with node_here(register_node.RegisterNode) as node:
         (output,) = node._outputs
-        tables = output.registrar._by_levels.tables
+        tables = output.registrar._matchers.by_levels.tables
         few = len(tables)
         for _ in range(10000):
             if node._preparation is None:

@@ -54,8 +54,14 @@ def test_it_is_free_once_the_last_result_is_delivered() -> None:
     node = Callbacks()
     worker = Worker(node)  # type: ignore[arg-type]
     free: list[bool] = [worker.is_free]
-    hold = threading.Event()
-    worker.submit(lambda: hold.wait(60.0), lambda _: free.append(worker.is_free))
+    begun, hold = threading.Event(), threading.Event()
+
+    def work() -> None:
+        begun.set()
+        hold.wait(60.0)
+
+    worker.submit(work, lambda _: free.append(worker.is_free))
+    assert begun.wait(60.0)
     free.append(worker.is_free)
     hold.set()
     # Done, but not delivered.

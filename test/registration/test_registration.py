@@ -448,6 +448,31 @@ class TestRecognition:
         assert recognise(SliceSpots(four, SCALE), cube) is None
 
 
+class TestWhatTheCallerGave:
+    """A result holds the caller's own options and frame, also where half of the false alarms are for a guess."""
+
+    @pytest.mark.parametrize("has_guess", [False, True])
+    @pytest.mark.parametrize("matcher", ["three_line", "maurin2009"])
+    def test_is_in_every_result(self, cube, has_guess, matcher):
+        truth = random_pose(np.random.default_rng(21), cube, SCANNER)
+        spots, _ = project(cube, truth, SCALE)
+        guess = truth if has_guess else None
+        options = RegistrationOptions(max_log10_false_alarms=-4.0, matcher=matcher)
+        again = load_frame("cube6")
+        accepted = register_spots(spots, again, SCALE, options, previous=guess)
+        too_few = register_spots(spots[:3], again, SCALE, options, previous=guess)
+        too_weak = replace(options, max_target_error_mm=0.001)
+        refused = register_spots(spots, again, SCALE, too_weak, previous=guess)
+        assert accepted
+        assert not too_few
+        assert not refused
+        assert refused.reason == "inaccurate"
+        for result, given in ((accepted, options), (too_few, options), (refused, too_weak)):
+            assert result.options is given
+            assert result.options.max_log10_false_alarms == -4.0
+            assert result.frame is again
+
+
 class TestScaleCovariance:
     def test_adds_what_the_scale_makes_uncertain(self, cube):
         truth = random_pose(np.random.default_rng(23), cube, SCANNER)
