@@ -73,7 +73,7 @@ def harmful_found(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_harm_is_seen_and_kept(name: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch, "_AGAIN_S", 1.5)
     kind = HARMFUL[name]
-    report = watch.run(kind, 8, 1, tmp_path / "run", kinds="harmful_kinds")
+    report = watch.run(kind, 8, 1, tmp_path / "run", kinds="support.harmful_kinds")
     assert report.inputs >= 8
     assert report.accepted > 0
     assert report.findings
@@ -87,7 +87,7 @@ def test_harm_is_seen_and_kept(name: str, told: str, tmp_path: Path, monkeypatch
 
 @pytest.mark.usefixtures("harmful_found")
 def test_what_does_no_harm_is_counted(tmp_path: Path) -> None:
-    report = watch.run(HARMFUL["harmless"], 300, 1, tmp_path / "run", kinds="harmful_kinds")
+    report = watch.run(HARMFUL["harmless"], 300, 1, tmp_path / "run", kinds="support.harmful_kinds")
     assert not report.findings
     assert report.inputs == 300
     assert 0 < report.accepted < 300
