@@ -153,7 +153,8 @@ def running(folder: Path, discovery: Callable[[Hosts, str], dict[str, str]]) -> 
             node_process(
                 "receive_dicom_node",
                 "--ros-args",
-                *["-p", "port:=0", "-p", f"max_queue:={QUEUE}"],
+                # However long a console is served meanwhile, the scanner's association stays.
+                *["-p", "port:=0", "-p", f"max_queue:={QUEUE}", "-p", "network_timeout:=600.0"],
                 env=discovery(network, RECEPTION) | profile,
                 within=network.command(RECEPTION),
             ) as receiver,
