@@ -81,15 +81,15 @@ def main() -> int:
     for kind, trials in (
         (Kind(43, 0, 0.0), arguments.sequences),
         (Kind(1, 0, 0.0), arguments.trials),
-        (Kind(10, 8, 0.0), arguments.trials // 4),
+        (Kind(10, 8, 0.0), max(arguments.trials // 4, 1)),
         (Kind(1, 8, 0.1), arguments.trials),
         (Kind(5, 8, 0.1), arguments.trials),
         (Kind(43, 0, 0.0, tolerance_mm=0.2), arguments.sequences),
         (Kind(1, 0, 0.0, tolerance_mm=0.2), arguments.trials),
-        (Kind(10, 8, 0.0, tolerance_mm=0.2), arguments.trials // 4),
-        (Kind(5, 8, 0.1, tolerance_mm=0.2), arguments.trials // 4),
-        (Kind(10, 8, 0.0, tolerance_mm=0.2, stated=True), arguments.trials // 4),
-        (Kind(5, 8, 0.0, tolerance_mm=0.2, larger=1.03, stated=True), arguments.trials // 4),
+        (Kind(10, 8, 0.0, tolerance_mm=0.2), max(arguments.trials // 4, 1)),
+        (Kind(5, 8, 0.1, tolerance_mm=0.2), max(arguments.trials // 4, 1)),
+        (Kind(10, 8, 0.0, tolerance_mm=0.2, stated=True), max(arguments.trials // 4, 1)),
+        (Kind(5, 8, 0.0, tolerance_mm=0.2, larger=1.03, stated=True), max(arguments.trials // 4, 1)),
     ):
         options = RegistrationOptions(spot_noise_px=CENTRE_NOISE_PX, frame_tolerance_mm=kind.tolerance_mm)
         rng = np.random.default_rng(kind.slices + kind.most_false)

@@ -46,11 +46,12 @@ def _attempt(data: bytes) -> None:
 
 def _read_as_file(data: bytes) -> None:
     _file().write_bytes(data)
-    try:
-        _check(read_slice(_file()))
-    except DicomError as error:
-        if not str(error).startswith(str(_file())):
-            raise AssertionError("a refusal does not name the file") from error
+    for slice_axes in (False, True):
+        try:
+            _check(read_slice(_file(), slice_axes=slice_axes))
+        except DicomError as error:
+            if not str(error).startswith(str(_file())):
+                raise AssertionError("a refusal does not name the file") from error
 
 
 def _check(dicom_slice: DicomSlice) -> None:

@@ -5,16 +5,13 @@ from __future__ import annotations
 import logging
 import queue
 import socket
-import ssl
 import threading
 import time
 from typing import Any, Final
 
 from pynetdicom import evt
-from pynetdicom.ae import ApplicationEntity
 from pynetdicom.association import Association
 from pynetdicom.events import Event
-from pynetdicom.presentation import PresentationContext
 from pynetdicom.transport import AssociationServer, RequestHandler
 
 from stereoreg_ros.reception.bounded_socket import BoundedSocket, Limits, describe
@@ -53,18 +50,10 @@ class BoundedServer(AssociationServer):
     limits: see Limits. The other arguments are those of AssociationServer.
     """
 
-    def __init__(
-        self,
-        ae: ApplicationEntity,
-        address: tuple[str, int],
-        ae_title: str,
-        contexts: list[PresentationContext],
-        ssl_context: ssl.SSLContext | None,
-        evt_handlers: list[Any],
-        limits: Limits,
-    ) -> None:
+    def __init__(self, *arguments: Any, limits: Limits, **keywords: Any) -> None:
         self.limits = limits
-        super().__init__(ae, address, ae_title, contexts, ssl_context, evt_handlers, _Connection)
+        keywords["request_handler"] = _Connection
+        super().__init__(*arguments, **keywords)
         self._admitted: list[Association] = []
         self._admission = threading.Lock()
         self.bind(evt.EVT_REQUESTED, self._admit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import ssl
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,31 +25,40 @@ _MAX_COMMENT_CHARACTERS: Final = 64
 _LOG = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class Endpoint:
+    """Where a storage receiver listens, and to whom.
+
+    address, port: of the interface; port 0: any that is free. ae_title: what clients must call. allowed_callers: AE
+    titles of the clients that are served; empty: all. tls: None for plain connections.
+    """
+
+    address: str
+    port: int
+    ae_title: str
+    allowed_callers: tuple[str, ...] = ()
+    tls: ssl.SSLContext | None = None
+
+
 class StorageService:
     """A storage receiver that passes objects to an Intake, and acknowledges those that it has taken.
 
-    address, port: where to listen; port 0: any that is free. ae_title: the title that clients must call.
-    allowed_callers: AE titles of the clients that are served; none: all.
-    tls: None for plain connections. kept: where objects are kept; None: nowhere.
+    kept: where objects are kept; None: nowhere.
     Raises OSError where it cannot listen there, ValueError for an invalid AE title.
     """
 
     def __init__(
         self,
-        address: str,
-        port: int,
-        ae_title: str,
-        allowed_callers: tuple[str, ...],
-        tls: ssl.SSLContext | None,
+        endpoint: Endpoint,
         limits: Limits,
         intake: Intake,
         kept: KeptObjects | None,
     ) -> None:
         self._intake = intake
         self._kept = kept
-        self._entity = entity = AE(ae_title)
+        self._entity = entity = AE(endpoint.ae_title)
         entity.require_called_aet = True
-        entity.require_calling_aet = list(allowed_callers)
+        entity.require_calling_aet = list(endpoint.allowed_callers)
         # The server has a limit of its own, so that this one is never reached.
         entity.maximum_associations = limits.max_associations + SPARE_CONNECTIONS
         entity.maximum_pdu_size = MAX_PDU_BYTES
@@ -59,8 +69,8 @@ class StorageService:
         for storage in (CTImageStorage, EnhancedCTImageStorage, MRImageStorage):
             entity.add_supported_context(storage, list(readable()))
         self._server: Any = entity.make_server(
-            (address, port),
-            ssl_context=tls,
+            (endpoint.address, endpoint.port),
+            ssl_context=endpoint.tls,
             server_class=BoundedServer,
             evt_handlers=[
                 (evt.EVT_C_STORE, self._store),

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +93,8 @@ def true_scene(
     false = _uniform(rng, int(rng.integers(most_false + 1)), around.scanner)
     configured = frame if stated_mm is None else with_tolerance(frame, stated_mm)
     options = {} if stated_scale is None else {"scale_tolerance": stated_scale}
-    scene = _scene(rng, _Drawn(spots[kept], rods[kept], false), configured, around, pose, true_frame)
-    return _with_options(scene, options)
+    drawn = _Drawn(spots[kept], rods[kept], false)
+    return _scene(rng, drawn, _Configured(configured, options=options), around, _Truth(pose, true_frame))
 
 
 def contradicted_prior(rng: np.random.Generator, frame: Frame, around: Surroundings, *, turn_deg: float) -> Scene:
@@ -107,7 +106,8 @@ def contradicted_prior(rng: np.random.Generator, frame: Frame, around: Surroundi
     nominal = centred_pose(frame, around.scanner, rotation=rotation)
     pose = _random_pose(rng, frame, around.scanner, nominal)
     spots, rods = _spots(rng, frame, pose, around.scanner.scale)
-    return _scene(rng, _Drawn(spots, rods), frame, replace(around, max_rotation_deg=30.0), pose, frame)
+    with_prior = replace(around, max_rotation_deg=30.0)
+    return _scene(rng, _Drawn(spots, rods), _Configured(frame), with_prior, _Truth(pose, frame))
 
 
 def wrong_spacing(
@@ -130,7 +130,7 @@ def wrong_spacing(
     middle_mm = pose @ _middle(frame)
     shift = np.append(scale.to_mm(true_scale.to_px(middle_mm[:2])) - middle_mm[:2], 0.0)
     seen = Pose(pose.rotation, pose.translation + shift)
-    return _scene(rng, _Drawn(spots, rods), frame, _with_scale(around, scale), seen, frame)
+    return _scene(rng, _Drawn(spots, rods), _Configured(frame, scale), around, _Truth(seen, frame))
 
 
 def scale_within_tolerance(
@@ -147,8 +147,7 @@ def scale_within_tolerance(
     true_frame = with_rod_ends_off(rng, frame, rod_ends_mm) if rod_ends_mm else frame
     spots, rods = _spots(rng, true_frame, pose, true_scale)
     configured, options = with_tolerance(frame, rod_ends_mm), {"scale_tolerance": std}
-    scene = _scene(rng, _Drawn(spots, rods), configured, _with_scale(around, scale), pose, true_frame)
-    return _with_options(scene, options)
+    return _scene(rng, _Drawn(spots, rods), _Configured(configured, scale, options), around, _Truth(pose, true_frame))
 
 
 def mirrored_rod(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Scene:
@@ -157,7 +156,8 @@ def mirrored_rod(rng: np.random.Generator, frame: Frame, around: Surroundings) -
     rod = int(rng.choice(np.flatnonzero(lean >= min(_LEANING_MM, lean.max()))))
     pose = _pose_within_prior(rng, frame, around)
     spots, rods = _spots(rng, frame, pose, around.scanner.scale)
-    return _scene(rng, _Drawn(spots, rods), with_rod_mirrored(frame, rod), around, pose, frame)
+    mirrored = _Configured(with_rod_mirrored(frame, rod))
+    return _scene(rng, _Drawn(spots, rods), mirrored, around, _Truth(pose, frame))
 
 
 def helical(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Scene:
@@ -170,7 +170,7 @@ def helical(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Sce
     # A point p is seen at p where its z is on the sloping plane: shear z away, then cut by z = 0.
     sheared = _sheared(frame, pose, HELICAL_SLOPE, half)
     spots, rods = _spots(rng, sheared, Pose.identity(), around.scanner.scale)
-    return _scene(rng, _Drawn(spots, rods), frame, around, pose, frame)
+    return _scene(rng, _Drawn(spots, rods), _Configured(frame), around, _Truth(pose, frame))
 
 
 def template(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Scene:
@@ -187,7 +187,7 @@ def template(rng: np.random.Generator, frame: Frame, around: Surroundings) -> Sc
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     middle = 0.5 * around.scanner.size_mm + rng.uniform(-_OFFSET_MM, _OFFSET_MM, 2)
     spots = around.scanner.scale.to_px(chosen @ rotation.T + middle) + rng.normal(0.0, NOISE_PX, chosen.shape)
-    return _scene(rng, _Drawn(np.empty((0, 2)), np.empty(0, np.intp), spots), frame, around, None, None)
+    return _scene(rng, _Drawn(false=spots), _Configured(frame), around, None)
 
 
 def sister(rng: np.random.Generator, frame: Frame, around: Surroundings, *, missing: int = 0) -> Scene:
@@ -212,7 +212,7 @@ def sister(rng: np.random.Generator, frame: Frame, around: Surroundings, *, miss
         left, right = (spots, others) if sides[0] < sides[1] else (others, spots)
         if left[:, 0].max() + 10 < right[:, 0].min():
             kept = rng.permutation(len(spots))[missing:]
-            return _scene(rng, _Drawn(spots[kept], rods[kept], others), frame, wide, pose, frame)
+            return _scene(rng, _Drawn(spots[kept], rods[kept], others), _Configured(frame), wide, _Truth(pose, frame))
     raise ValueError(f"frame '{frame.name}': no two poses found that do not overlap")
 
 
@@ -238,8 +238,8 @@ def fragments(
     spots = (centres[:, None] + offset).reshape(-1, 2)
     spots += rng.normal(0.0, NOISE_PX, spots.shape)
     previous = _near(rng, pose, frame, rng.uniform(1.0, 2.0), 1.0) if with_previous else None
-    scene = _scene(rng, _Drawn(spots, np.repeat(rods, count)), frame, around, pose, frame)
-    return replace(scene, previous=previous)
+    configured = _Configured(frame, previous=previous)
+    return _scene(rng, _Drawn(spots, np.repeat(rods, count)), configured, around, _Truth(pose, frame))
 
 
 def collinear(rng: np.random.Generator, frame: Frame, around: Surroundings, *, missing: int = 0) -> Scene:
@@ -255,7 +255,7 @@ def collinear(rng: np.random.Generator, frame: Frame, around: Surroundings, *, m
     clutter = clutter[((clutter >= 0) & (clutter < scanner.shape[::-1])).all(axis=1)]
     clutter += rng.normal(0.0, NOISE_PX, clutter.shape)
     kept = rng.permutation(len(spots))[missing:]
-    return _scene(rng, _Drawn(spots[kept], rods[kept], clutter), frame, around, pose, frame)
+    return _scene(rng, _Drawn(spots[kept], rods[kept], clutter), _Configured(frame), around, _Truth(pose, frame))
 
 
 def with_rod_ends_off(rng: np.random.Generator, frame: Frame, std_mm: float) -> Frame:
@@ -280,37 +280,51 @@ def with_rod_mirrored(frame: Frame, rod: int) -> Frame:
     return replace(frame, name=f"{frame.name}, {frame.line_names[rod]} mirrored", starts=starts, ends=ends)
 
 
-class _Drawn(NamedTuple):
-    """Spots (k, 2) of rods whose rows are (k,), and false ones (f, 2), in pixel."""
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Spots (s, 2) in pixel, the rods (s,) that made them, and false spots (k, 2)."""
 
-    spots: Array
-    rods: NDArray[np.intp]
-    false: Array = np.empty((0, 2))
+    spots: Array = field(default_factory=lambda: np.empty((0, 2)))
+    rods: NDArray[np.intp] = field(default_factory=lambda: np.empty(0, np.intp))
+    false: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Configured:
+    """What is configured besides the prior; see Scene. scale: None where it is the true one."""
+
+    frame: Frame
+    scale: PixelScale | None = None
+    options: dict[str, float] = field(default_factory=dict)
+    previous: Pose | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """scanner_from_frame, and the frame as it truly is."""
+
+    pose: Pose
+    frame: Frame
 
 
 def _scene(
-    rng: np.random.Generator,
-    drawn: _Drawn,
-    frame: Frame,
-    around: Surroundings,
-    truth: Pose | None,
-    true_frame: Frame | None,
+    rng: np.random.Generator, drawn: _Drawn, configured: _Configured, around: Surroundings, truth: _Truth | None
 ) -> Scene:
-    scale = around.scanner.scale
-    every = np.concatenate([drawn.spots, drawn.false])
-    made_by = np.concatenate([drawn.rods, np.full(len(drawn.false), NO_ROD)])
-    order = rng.permutation(len(every))
-    area = float(np.prod(around.scanner.shape)) * scale.sx * scale.sy
-    options = {"max_rotation_deg": around.max_rotation_deg}
-    return Scene(every[order], made_by[order], frame, scale, options, area, None, truth, true_frame)
-
-
-def _with_options(scene: Scene, options: dict[str, float]) -> Scene:
-    return replace(scene, options={**scene.options, **options})
-
-
-def _with_scale(around: Surroundings, scale: PixelScale) -> Surroundings:
-    return replace(around, scanner=replace(around.scanner, scale=scale))
+    scale = configured.scale or around.scanner.scale
+    spots = np.concatenate([drawn.spots, drawn.false])
+    rods = np.concatenate([drawn.rods, np.full(len(drawn.false), NO_ROD)])
+    order = rng.permutation(len(spots))
+    return Scene(
+        spots_px=spots[order],
+        rods=rods[order],
+        frame=configured.frame,
+        scale=scale,
+        options={"max_rotation_deg": around.max_rotation_deg, **configured.options},
+        slice_area_mm2=float(np.prod(around.scanner.shape)) * scale.sx * scale.sy,
+        previous=configured.previous,
+        truth=truth.pose if truth is not None else None,
+        true_frame=truth.frame if truth is not None else None,
+    )
 
 
 def _uniform(rng: np.random.Generator, count: int, scanner: ScannerSettings) -> Array:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,10 @@ from stereoreg_ros.geometry.slice import PixelScale
 
 AIR_HU: Final = -1000.0
 
-# The patient, painted in this order: centre x, y and half axes of ellipses as shares of the image's width and height,
-# the tilt in degrees, HU.
-_BODY: Final = (
+# Centre x, y and half axes as shares of the image's width and height, the tilt in degrees, HU.
+_Ellipse: TypeAlias = tuple[float, float, float, float, float, float]
+# The patient, painted in this order.
+_BODY: Final[tuple[_Ellipse, ...]] = (
     (0.500, 0.715, 0.455, 0.275, 0, -95),  # skin and fat
     (0.500, 0.720, 0.425, 0.248, 0, 55),  # muscle
     (0.500, 0.705, 0.375, 0.205, 0, -80),  # fat of the abdomen
@@ -55,7 +55,7 @@ def background(shape: tuple[int, int], scale: PixelScale, body: bool) -> NDArray
     return image
 
 
-def _ribs() -> list[tuple[float, float, float, float, float, float]]:
+def _ribs() -> list[_Ellipse]:
     """Ribs in the muscle, cortex and marrow, in the form of _BODY."""
     _, _, width, height, _, _ = _BODY[1]
     ribs = []
@@ -67,7 +67,7 @@ def _ribs() -> list[tuple[float, float, float, float, float, float]]:
     return ribs
 
 
-def _paint_ellipse(image: NDArray[np.float32], ellipse: Sequence[float], scale: PixelScale) -> None:
+def _paint_ellipse(image: NDArray[np.float32], ellipse: _Ellipse, scale: PixelScale) -> None:
     x, y, half_x, half_y, tilt_deg, hu = ellipse
     rows, columns = image.shape
     width, height = columns * scale.sx, rows * scale.sy

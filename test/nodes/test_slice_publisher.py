@@ -86,7 +86,7 @@ def test_the_image_comes_last_with_the_stamp_and_axes_of_all(tmp_path: Path) -> 
 def test_a_slice_without_a_plane_has_no_pose(tmp_path: Path) -> None:
     """Not the identity, which would be believed."""
     elements: dict[str, Any] = {"ImagePositionPatient": None, "ImageOrientationPatient": None}
-    read = read_slice(write_slice(tmp_path / "a.dcm", IMAGE, **elements))
+    read = read_slice(write_slice(tmp_path / "a.dcm", IMAGE, **elements), slice_axes=True)
     assert list(Output().publish(read)) == ["slice_spacing", "slice_frame_of_reference", "image"]
 
 

@@ -21,7 +21,7 @@ from stereoreg_ros.reception.bounded_socket import Limits
 from stereoreg_ros.reception.intake import Intake
 from stereoreg_ros.reception.kept_objects import KeptObjects
 from stereoreg_ros.reception.slice_queue import SliceQueue
-from stereoreg_ros.reception.storage_service import StorageService
+from stereoreg_ros.reception.storage_service import Endpoint, StorageService
 from support.dicom_clients import association, echo, send
 from support.dicom_files import write_slice
 
@@ -39,7 +39,7 @@ def service(
 ) -> Iterator[StorageService]:
     """A receiver that is running."""
     intake = Intake(queue, limits.max_object_bytes)
-    one = StorageService("127.0.0.1", 0, "STEREOREG", callers, None, limits, intake, kept)
+    one = StorageService(Endpoint("127.0.0.1", 0, "STEREOREG", callers), limits, intake, kept)
     one.start()
     try:
         yield one

@@ -21,7 +21,7 @@ from stereoreg_ros.nodes.scanner.registration_answers import RegistrationAnswers
 from stereoreg_ros.reception.intake import Intake
 from stereoreg_ros.reception.kept_objects import KeptObjects
 from stereoreg_ros.reception.slice_queue import ReceivedSlice, SliceQueue
-from stereoreg_ros.reception.storage_service import StorageService
+from stereoreg_ros.reception.storage_service import Endpoint, StorageService
 from stereoreg_ros.reception.tls import TlsError, server_context
 from stereoreg_ros.reception.watched_folder import WatchedFolder
 
@@ -104,16 +104,8 @@ class ReceiveDicomNode(Node):
             if settings.tls_certificate:
                 client_ca = Path(settings.tls_client_ca) if settings.tls_client_ca else None
                 tls = server_context(Path(settings.tls_certificate), Path(settings.tls_key), client_ca)
-            return StorageService(
-                settings.address,
-                settings.port,
-                settings.ae_title,
-                settings.allowed_callers,
-                tls,
-                settings.limits,
-                intake,
-                kept,
-            )
+            endpoint = Endpoint(settings.address, settings.port, settings.ae_title, settings.allowed_callers, tls)
+            return StorageService(endpoint, settings.limits, intake, kept)
         except TlsError as error:
             raise ParameterError(str(error)) from None
         except OSError as error:
