@@ -60,3 +60,12 @@ def test_every_equation_is_where_the_index_says(which: str, where: str) -> None:
         tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
         defined = {node.name for node in tree.body if isinstance(node, (ast.FunctionDef, ast.ClassDef))}
         assert set(re.findall(r"\w+", names)) <= defined, file
+
+
+def test_the_page_of_the_architecture_names_classes_of_the_package() -> None:
+    text = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([A-Z][a-z]+\w*)`", text))
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")]
+    classes = {node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    assert {"IncomingSlice", "SliceSpots", "Problem", "PoseEstimate"} <= named
+    assert named <= classes
