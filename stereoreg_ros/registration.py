@@ -184,7 +184,7 @@ def register_spots(
     the centres, pixel^2, as their image shows them; where they are smaller than `spot_noise_px` has it, that counts, as
     the frame is known no better. scale_covariance: (2, 2) of (sx, sy) or (3, 3) of (sx, sy, shear), mm^2/pixel^2, where
     the scale was measured: what it makes the pose uncertain by is added to the pose's covariance.
-    Raises ValueError where the spots are not of shape (n, 2) or not finite, or a covariance is none.
+    Raises ValueError where the spots are not of shape (n, 2) or not finite, or where a covariance is not one.
     """
     spots = SliceSpots(
         np.asarray(spots_px, dtype=np.float64),
