@@ -28,8 +28,9 @@ from stereoreg_ros.result import PoseEstimate, Recognition, Refusal, Registratio
 from stereoreg_ros.spots import find_spots
 from stereoreg_ros.uncertainty import checked_scale_covariance
 
-# The functions of this module keep the tables of so many frames, of up to 300 MB each.
-_KEPT_FRAMES: Final = 3
+# How many frames the functions of this module keep the tables of: mostly tens of MB each, with all of them prepared up
+# to 300. Slices that show more frames than this are for a caller with a `Registrar` for each.
+_KEPT_FRAMES: Final = 8
 
 
 class Registrar:
