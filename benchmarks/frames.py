@@ -10,10 +10,10 @@ from tqdm import tqdm
 
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.frames.ambiguity import reasons, trials
-from stereoreg_ros.frames.design_search import Wish, random_layouts
+from stereoreg_ros.frames.design_search import Requirements, random_layouts
 from stereoreg_ros.frames.expected_error import Imaging
 from stereoreg_ros.frames.layouts import Envelope, Layouts, gaps
-from stereoreg_ros.frames.meeting import meetings
+from stereoreg_ros.frames.slice_poses import slice_poses
 
 # What cube5 and cube8 were designed for; see the comments in their files.
 ENVELOPE = Envelope((60.0, 60.0, 60.0), 5.0)
@@ -35,12 +35,12 @@ def main() -> int:
     print("frame  rods  gap/mm  95 % target error/mm  best random  median random   sets  accepted  ambiguous  wrong")
     for name in arguments.frames:
         frame = load_frame(name)
-        wish = Wish(ENVELOPE, tuple(frame.diameters), IMAGING, TARGET_MM, TILT_DEG, HEIGHT_MM)
-        error = float(wish.target_errors(Layouts.of(frame))[0])
-        drawn = random_layouts(wish, arguments.layouts, np.random.default_rng(0))
+        requirements = Requirements(ENVELOPE, tuple(frame.diameters), IMAGING, TARGET_MM, TILT_DEG, HEIGHT_MM)
+        error = float(requirements.target_errors(Layouts.of(frame))[0])
+        drawn = random_layouts(requirements, arguments.layouts, np.random.default_rng(0))
         random = np.concatenate(
             [
-                wish.target_errors(ENVELOPE.layouts(part, frame.diameters))
+                requirements.target_errors(ENVELOPE.layouts(part, frame.diameters))
                 for part in np.array_split(drawn, max(1, len(drawn) // 100))
             ]
         )
@@ -50,7 +50,7 @@ def main() -> int:
             scale_tolerance=0.0,
             slice_thickness_mm=IMAGING.thickness_mm,
         )
-        poses = meetings(arguments.poses, 7, np.zeros(3), np.array([-HEIGHT_MM, HEIGHT_MM]), TILT_DEG)
+        poses = slice_poses(arguments.poses, 7, np.zeros(3), np.array([-HEIGHT_MM, HEIGHT_MM]), TILT_DEG)
         left_out: list[int | None] = [None, *range(len(frame))]
         tried = trials(frame, poses, SCALE, options, left_out, np.random.default_rng(1))
         total = len(poses) * len(left_out)

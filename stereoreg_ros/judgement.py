@@ -94,7 +94,7 @@ class Case:
 
 
 def unfit(frame: Frame, spots: int, options: RegistrationOptions) -> Verdict | None:
-    """Why a slice with so many spots is refused before anything is sought; None where it is not."""
+    """Why a slice is refused before anything is sought, by the number of its spots; None where it is not."""
     return check_orientation(frame, options) or check_count(spots, options)
 
 
@@ -151,7 +151,7 @@ def _nothing_found(case: Case) -> Verdict | None:
     nothing = f"no pose puts {min(fewest, case.rods)} of the {case.rods} rods on any of the {case.spots} spots"
     if fewest <= case.problem.min_inliers:
         return Verdict("no_consensus", nothing)
-    fewer = f"{fewest - 1} rods could hardly be told from chance among so many spots"
+    fewer = f"{fewest - 1} rods could hardly be told from chance among that many spots"
     return Verdict("no_consensus", f"{nothing}, and {fewer}" if fewest <= case.rods else fewer)
 
 

@@ -1,4 +1,4 @@
-"""What a registration can be told: one table for the Python call, the command line and the node's parameters."""
+"""The options of a registration: one table for the Python call, the command line and the node's parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stereoreg_ros.geometry.pose import rotation_from_quaternion
 
 AUTO: Final = "auto"
 MATCHERS: Final = ("three_line", "maurin2009")
-# No point that matters is farther from the frame; one that is was told in other units.
+# No point that matters is farther from the frame; one that is was given in other units.
 _FARTHEST_MM: Final = 10_000.0
 # How far a pixel spacing may be off, as a share: what a scanner states with its slices, and what somebody typed in.
 _STATED_CHANGE: Final = 0.005
@@ -21,7 +21,7 @@ _TYPED_CHANGE: Final = 0.15
 def _option(
     default: Any, description: str, low: float | None = None, high: float | None = None, word: str | None = None
 ) -> Any:
-    """A field with what users are told of it; word: what it may be instead of a number."""
+    """A field with its description for users; word: what it may be instead of a number."""
     return field(default=default, metadata={"description": description, "low": low, "high": high, "word": word})
 
 

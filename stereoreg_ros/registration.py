@@ -28,8 +28,9 @@ from stereoreg_ros.result import PoseEstimate, Recognition, Refusal, Registratio
 from stereoreg_ros.spots import find_spots
 from stereoreg_ros.uncertainty import checked_scale_covariance
 
-# The functions of this module keep the tables of so many frames, of up to 300 MB each.
-_KEPT_FRAMES: Final = 3
+# How many frames the functions of this module keep the tables of: mostly tens of MB each, with all of them prepared up
+# to 300. Slices that show more frames than this are for a caller with a `Registrar` for each.
+_KEPT_FRAMES: Final = 8
 
 
 class Registrar:
@@ -184,7 +185,7 @@ def register_spots(
     the centres, pixel^2, as their image shows them; where they are smaller than `spot_noise_px` has it, that counts, as
     the frame is known no better. scale_covariance: (2, 2) of (sx, sy) or (3, 3) of (sx, sy, shear), mm^2/pixel^2, where
     the scale was measured: what it makes the pose uncertain by is added to the pose's covariance.
-    Raises ValueError where the spots are not of shape (n, 2) or not finite, or a covariance is none.
+    Raises ValueError where the spots are not of shape (n, 2) or not finite, or where a covariance is not one.
     """
     spots = SliceSpots(
         np.asarray(spots_px, dtype=np.float64),

@@ -1,4 +1,4 @@
-"""How far a pose may be off at most, where no spot is off by more than is told."""
+"""How far a pose may be off at most, where no spot is off by more than a given error."""
 
 from __future__ import annotations
 

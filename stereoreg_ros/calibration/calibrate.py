@@ -44,7 +44,7 @@ def calibrate(
     enough = [one for one in slices if len(one) >= max(MIN_LINES, options.min_inliers)]
     if not enough:
         return CalibrationRefusal(
-            f"calibration refused: {MIN_LINES} rods are needed, and none of {len(slices)} slices has so many spots"
+            f"calibration refused: {MIN_LINES} rods are needed, and none of {len(slices)} slices has that many spots"
         )
     found = _explained(enough, frame, scale, options, calibration)
     if isinstance(found, str) or len(found.matched) < _EXPLAINED * len(enough):

@@ -23,7 +23,7 @@ from stereoreg_ros.cli.parsing import (
     make_folder,
 )
 from stereoreg_ros.files.whole_file import write_whole
-from stereoreg_ros.frames.design_search import Wish
+from stereoreg_ros.frames.design_search import Requirements
 from stereoreg_ros.frames.expected_error import Imaging
 from stereoreg_ros.frames.inspection_table import table_of
 from stereoreg_ros.frames.layouts import Envelope
@@ -92,8 +92,8 @@ def _design(arguments: argparse.Namespace) -> int:
     make_folder("--output", arguments.output)
     try:
         options = given(RegistrationOptions, arguments, USED_OPTIONS)
-        wish = _wish(arguments, options)
-        proposal = _proposed(arguments, wish, options)
+        requirements = _requirements(arguments, options)
+        proposal = _proposed(arguments, requirements, options)
     except ValueError as error:
         raise WrongCallError(str(error)) from None
     path = arguments.output / f"{arguments.name}.yaml"
@@ -117,9 +117,9 @@ def _design(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _wish(arguments: argparse.Namespace, options: RegistrationOptions) -> Wish:
+def _requirements(arguments: argparse.Namespace, options: RegistrationOptions) -> Requirements:
     envelope = Envelope(tuple(arguments.envelope), arguments.gap)
-    return Wish(
+    return Requirements(
         envelope,
         (arguments.diameter,) * arguments.lines,
         Imaging.of(PixelScale(*arguments.pixel_spacing), options),
@@ -129,7 +129,7 @@ def _wish(arguments: argparse.Namespace, options: RegistrationOptions) -> Wish:
     )
 
 
-def _proposed(arguments: argparse.Namespace, wish: Wish, options: RegistrationOptions) -> Proposal:
+def _proposed(arguments: argparse.Namespace, requirements: Requirements, options: RegistrationOptions) -> Proposal:
     with tqdm(total=1.0, leave=False, disable=not watched(), bar_format="{desc} {percentage:3.0f}% |{bar}|") as bar:
 
         def report(what: str, share: float, least: float) -> bool:
@@ -138,7 +138,7 @@ def _proposed(arguments: argparse.Namespace, wish: Wish, options: RegistrationOp
             bar.refresh()
             return True
 
-        return propose(wish, arguments.name, options, arguments.seed, arguments.chains, report)
+        return propose(requirements, arguments.name, options, arguments.seed, arguments.chains, report)
 
 
 def _comment(arguments: argparse.Namespace, proposal: Proposal) -> str:

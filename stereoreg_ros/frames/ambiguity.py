@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoreg_ros.frames.meeting import Meetings
+from stereoreg_ros.frames.slice_poses import SlicePoses
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, rotation_angle
 from stereoreg_ros.geometry.projection import project
@@ -37,7 +37,7 @@ class Trial:
 
 def trials(
     frame: Frame,
-    poses: Meetings,
+    poses: SlicePoses,
     scale: PixelScale,
     options: RegistrationOptions,
     left_out: Sequence[int | None],
@@ -74,8 +74,8 @@ def trials(
                     away = estimate.slice_from_frame @ slice_from_frame.inverse()
                     moved = estimate.slice_from_frame.translation - slice_from_frame.translation
                     angle = math.degrees(float(rotation_angle(away.rotation)))
-                    told = f"{','.join(names[0])} -> {','.join(names[1])}"
-                    twins.append((told, angle, float(np.linalg.norm(moved))))
+                    exchange = f"{','.join(names[0])} -> {','.join(names[1])}"
+                    twins.append((exchange, angle, float(np.linalg.norm(moved))))
             yield Trial(out, "" if result else result.reason, right, tuple(twins))
 
 

@@ -12,7 +12,7 @@ from scipy.optimize import basinhopping
 
 from stereoreg_ros.frames.expected_error import Imaging, expected, point_covariances, pooled_error_95
 from stereoreg_ros.frames.layouts import Envelope, Layouts, gaps
-from stereoreg_ros.frames.meeting import Meetings, meetings
+from stereoreg_ros.frames.slice_poses import SlicePoses, slice_poses
 from stereoreg_ros.geometry.pose import Array
 
 _POSES = 64
@@ -27,7 +27,7 @@ _STEP = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Wish:
+class Requirements:
     """What a frame shall do.
 
     diameters_mm: (n,), one a rod; target_mm: (3,), the point in the frame's axes whose 95 % error shall be small;
@@ -41,7 +41,7 @@ class Wish:
     target_mm: tuple[float, float, float]
     largest_tilt_deg: float
     largest_height_mm: float
-    poses: Meetings = field(init=False)
+    poses: SlicePoses = field(init=False)
 
     def __post_init__(self) -> None:
         if not 4 <= len(self.diameters_mm) <= 20:
@@ -60,7 +60,7 @@ class Wish:
             raise ValueError(f"target is {self.target_mm!r}, expected three numbers in mm")
         heights = np.array([-self.largest_height_mm, self.largest_height_mm])
         # The same poses for all layouts, so that the error is a smooth function of the layout.
-        object.__setattr__(self, "poses", meetings(_POSES, 0, np.zeros(3), heights, self.largest_tilt_deg))
+        object.__setattr__(self, "poses", slice_poses(_POSES, 0, np.zeros(3), heights, self.largest_tilt_deg))
 
     def target_errors(self, layouts: Layouts) -> Array:
         """Radius (s,) in mm of the 95 % target error over all poses, for each layout."""
@@ -93,74 +93,74 @@ class Candidate:
     interrupted: bool
 
 
-def random_layouts(wish: Wish, count: int, rng: np.random.Generator) -> Array:
+def random_layouts(requirements: Requirements, count: int, rng: np.random.Generator) -> Array:
     """`count` layouts (count, 4 n) that can be built, their rods' ends drawn evenly over the faces.
 
     Raises ValueError where hardly any layout drawn so can be built.
     """
     found: list[Array] = []
     for _ in range(max(100, 4 * count)):
-        corners = rng.uniform(size=(256, 4 * len(wish.diameters_mm)))
-        found.extend(corners[wish.can_be_built(corners)])
+        corners = rng.uniform(size=(256, 4 * len(requirements.diameters_mm)))
+        found.extend(corners[requirements.can_be_built(corners)])
         if len(found) >= count:
             return np.array(found[:count])
-    size = " x ".join(f"{length:g}" for length in wish.envelope.size_mm)
+    size = " x ".join(f"{length:g}" for length in requirements.envelope.size_mm)
     raise ValueError(
-        f"of random layouts of {len(wish.diameters_mm)} rods with {wish.envelope.gap_mm:g} mm between them "
-        f"hardly any fits into {size} mm; fewer rods, a smaller gap or a larger envelope is needed"
+        f"of random layouts of {len(requirements.diameters_mm)} rods with {requirements.envelope.gap_mm:g} mm between "
+        f"them hardly any fits into {size} mm; fewer rods, a smaller gap or a larger envelope is needed"
     )
 
 
 def search(
-    wish: Wish, seed: int, chains: int, progress: Callable[[float, float], bool] | None = None
+    requirements: Requirements, seed: int, chains: int, progress: Callable[[float, float], bool] | None = None
 ) -> list[Candidate]:
-    """The layouts that several chains of hops have found, the best first; progress: told the share done and the least
-    error so far, mm, says whether to go on.
+    """The layouts that several chains of hops have found, the best first; progress: called with the share done and the
+    least error so far, mm, says whether to go on.
 
     Where it says not to, or an interruption (KeyboardInterrupt) comes, what was found so far is returned, at least the
     best of some random layouts. The chains are spread over the cores by joblib, in whatever backend its
     `parallel_config` has chosen. Raises ValueError where no layout that can be built was found.
     """
     seeds = np.random.SeedSequence(seed).spawn(chains + 1)
-    drawn = random_layouts(wish, _DRAWN, np.random.default_rng(seeds[-1]))
-    costs = wish.costs(drawn)
+    drawn = random_layouts(requirements, _DRAWN, np.random.default_rng(seeds[-1]))
+    costs = requirements.costs(drawn)
     found = [(drawn[costs.argmin()], float(costs.min()))]
     done, interrupted, together = 0, False, effective_n_jobs(-1)
     try:
         while done < chains and not interrupted:
-            # As many at a time as there are cores, so that somebody is told in between.
+            # As many at a time as there are cores, so that progress is reported in between.
             batch = seeds[done : min(done + together, chains)]
-            made = Parallel(n_jobs=-1)(delayed(_chain)(wish, one) for one in batch)
-            found += [(corners, cost) for corners, cost in made if wish.can_be_built(corners[None])[0]]
+            made = Parallel(n_jobs=-1)(delayed(_chain)(requirements, one) for one in batch)
+            found += [(corners, cost) for corners, cost in made if requirements.can_be_built(corners[None])[0]]
             done += len(batch)
             least = min(cost for _, cost in found)
             interrupted = progress is not None and not progress(done / chains, least) and done < chains
     except KeyboardInterrupt:
         interrupted = True
-    layouts = wish.envelope.layouts(np.array([corners for corners, _ in found]), wish.diameters_mm)
-    errors = wish.target_errors(layouts)
+    layouts = requirements.envelope.layouts(np.array([corners for corners, _ in found]), requirements.diameters_mm)
+    errors = requirements.target_errors(layouts)
     return [Candidate(found[row][0], float(errors[row]), interrupted) for row in np.argsort(errors)]
 
 
-def _chain(wish: Wish, seed: np.random.SeedSequence) -> tuple[Array, float]:
+def _chain(requirements: Requirements, seed: np.random.SeedSequence) -> tuple[Array, float]:
     """From the best of some random layouts: one rod is drawn anew, all descend together, the better layout stays."""
     rng = np.random.default_rng(seed)
-    start = random_layouts(wish, _DRAWN, rng)
+    start = random_layouts(requirements, _DRAWN, rng)
 
     def redraw(corners: Array) -> Array:
         moved = corners.copy()
-        rod = int(rng.integers(len(wish.diameters_mm)))
+        rod = int(rng.integers(len(requirements.diameters_mm)))
         moved[4 * rod : 4 * rod + 4] = rng.uniform(size=4)
         return moved
 
     def cost_and_slope(corners: Array) -> tuple[float, Array]:
         inward = np.where(corners > 0.5, -_STEP, _STEP)
-        costs = wish.costs(np.concatenate([corners[None], corners + np.diag(inward)]))
+        costs = requirements.costs(np.concatenate([corners[None], corners + np.diag(inward)]))
         return float(costs[0]), (costs[1:] - costs[0]) / inward
 
     found = basinhopping(
         cost_and_slope,
-        start[wish.costs(start).argmin()],
+        start[requirements.costs(start).argmin()],
         niter=_HOPS,
         T=_TEMPERATURE_MM,
         take_step=redraw,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import erf, gammainc
 
 from stereoreg_ros.frames.layouts import Layouts
-from stereoreg_ros.frames.meeting import Meetings
+from stereoreg_ros.frames.slice_poses import SlicePoses
 from stereoreg_ros.geometry.pose import Array, skew
 from stereoreg_ros.geometry.projection import Cuts, cut, cut_jacobian, rod_covariances
 from stereoreg_ros.geometry.slice import PixelScale
@@ -66,7 +66,7 @@ class Expected:
     cuts: Cuts
 
 
-def expected(layouts: Layouts, poses: Meetings, imaging: Imaging, left_out: int | None = None) -> Expected:
+def expected(layouts: Layouts, poses: SlicePoses, imaging: Imaging, left_out: int | None = None) -> Expected:
     """Cramer-Rao bound of the pose from the visible rods; left_out: one that is taken for missing.
 
     Noise and the errors of the rods are independent from spot to spot. That of the scale is common to all: it stretches

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stereoreg_ros.frames.ambiguity import Trial, reasons, trials
 from stereoreg_ros.frames.expected_error import Expected, Imaging, expected, point_covariances, scale_information
 from stereoreg_ros.frames.layouts import Layouts
-from stereoreg_ros.frames.meeting import Meetings, meetings
+from stereoreg_ros.frames.slice_poses import SlicePoses, slice_poses
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, rotation_from_quaternion
 from stereoreg_ros.geometry.projection import Cuts
@@ -51,7 +51,7 @@ class Inspection:
     options: RegistrationOptions
     scale: PixelScale
     tolerances_mm: Array
-    poses: Meetings
+    poses: SlicePoses
     shown: float
     visible: NDArray[np.bool_]
     error_origin_mm: Array
@@ -110,7 +110,7 @@ def inspect_frame(
 
     largest_tilt_deg: of the slice's normal against the frame's z axis as it nominally stands (`nominal_orientation`),
     within `max_rotation_deg`. A tenth of the poses are given to the registration itself, with one rod left out after
-    the other. progress: told the share done; where it returns False, these are cut short.
+    the other. progress: called with the share done; where it returns False, these are cut short.
     Raises ValueError where no pose shows `min_inliers` rods, or the tilt is out of range.
     """
     if not 0 <= largest_tilt_deg <= 180:
@@ -154,37 +154,37 @@ def twins_of(tried: list[Trial]) -> list[dict[str, Any]]:
     """The wrong explanations, the most frequent first: which rods stand for which, how often, how far off."""
     found: dict[str, list[tuple[float, float]]] = defaultdict(list)
     for trial in tried:
-        for told, angle, distance in trial.twins:
-            found[told].append((angle, distance))
+        for exchange, angle, distance in trial.twins:
+            found[exchange].append((angle, distance))
     return [
         {
-            "rods": told,
+            "rods": exchange,
             "times": len(where),
             "angle_deg": float(np.median([angle for angle, _ in where])),
             "distance_mm": float(np.median([distance for _, distance in where])),
         }
-        for told, where in sorted(found.items(), key=lambda item: -len(item[1]))
+        for exchange, where in sorted(found.items(), key=lambda item: -len(item[1]))
     ]
 
 
-def _drawn(frame: Frame, options: RegistrationOptions, tilt_deg: float, count: int, seed: int) -> Meetings:
+def _drawn(frame: Frame, options: RegistrationOptions, tilt_deg: float, count: int, seed: int) -> SlicePoses:
     ends = np.concatenate([frame.starts, frame.ends])
     middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
     reach = float(np.linalg.norm(ends - middle, axis=1).max())
     nominal = rotation_from_quaternion(options.nominal_orientation)
     heights = np.array([-reach, reach])
-    return meetings(count, seed, middle, heights, tilt_deg, nominal, options.max_rotation_deg)
+    return slice_poses(count, seed, middle, heights, tilt_deg, nominal, options.max_rotation_deg)
 
 
 def _tried(
     frame: Frame,
-    poses: Meetings,
+    poses: SlicePoses,
     scale: PixelScale,
     options: RegistrationOptions,
     seed: int,
     progress: Callable[[float], bool] | None,
 ) -> list[Trial]:
-    """All rods in every pose; one left out, in turn, in so many that it takes as long again."""
+    """All rods in every pose; one left out, in turn, in as many poses as take that long again."""
     rng = np.random.default_rng(seed)
     n = len(frame)
     few = poses.take(np.arange(0, len(poses), n))
@@ -252,9 +252,9 @@ def _shares(counts: NDArray[np.intp]) -> dict[int, float]:
 
 def _spread(values: Array) -> dict[str, float | None]:
     """Median, 95 % quantile and worst; None for what is infinite or as good as that."""
-    told = {
+    figures = {
         "median": np.median(values),
         "95_percent": np.quantile(values, 0.95, method="higher"),
         "worst": values.max(),
     }
-    return {name: float(value) if value < 1e5 else None for name, value in told.items()}
+    return {name: float(value) if value < 1e5 else None for name, value in figures.items()}

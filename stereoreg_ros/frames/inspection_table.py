@@ -65,12 +65,12 @@ def _tolerances(inspection: Inspection) -> str:
     """What the rods' ends were taken to be known to, and whether the frame file or the option says so."""
     names, tolerances = inspection.frame.line_names, inspection.tolerances_mm
     if (tolerances == tolerances[0]).all():
-        told = f"{tolerances[0]:g} mm"
+        listed = f"{tolerances[0]:g} mm"
     else:
-        told = ", ".join(f"{name} {one:g}" for name, one in zip(names, tolerances, strict=True)) + " mm"
+        listed = ", ".join(f"{name} {one:g}" for name, one in zip(names, tolerances, strict=True)) + " mm"
     own = ~np.isnan(inspection.frame.tolerances_or(np.nan))
     source = "frame file" if own.all() else "frame_tolerance_mm" if not own.any() else "frame file, frame_tolerance_mm"
-    return f"rods' ends to {told} per axis ({source})"
+    return f"rods' ends to {listed} per axis ({source})"
 
 
 def _quantiles(values: Array) -> str:
@@ -87,5 +87,5 @@ def _outcomes(made: Sequence[Trial]) -> str:
         return "not tried"
     counts = reasons(made)
     wrong = sum(not trial.reason and not trial.right for trial in made)
-    told = ", ".join(f"{100 * times / len(made):.1f} % {word}" for word, times in counts.most_common())
-    return f"{told}; {wrong} of {len(made)} accepted with a wrong rod"
+    listed = ", ".join(f"{100 * times / len(made):.1f} % {word}" for word, times in counts.most_common())
+    return f"{listed}; {wrong} of {len(made)} accepted with a wrong rod"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.slice import PixelScale
 
-# A variance that rounding has made negative is none.
+# By how much rounding may make a variance negative.
 _ROUNDING_PX2: Final = 1e-9
 
 

@@ -27,7 +27,7 @@ from stereoreg_ros.matching.triple_order import triple_order
 from stereoreg_ros.matching.twins import Twins
 from stereoreg_ros.options import RegistrationOptions
 
-# From so many rods on, twins are looked for by further triples only of a frame that has them.
+# From this many rods on, twins are looked for by further triples only of a frame that has them.
 _FEWEST_WITHOUT_TWINS: Final = 6
 
 
@@ -51,14 +51,14 @@ class ByLevels:
 
         known: some of them, best first, accepted elsewhere and not sought again.
 
-        Explanations of all rods are sought first, then of all but one, and so on. At each level every set of so many
+        Explanations of all rods are sought first, then of all but one, and so on. At each level every set of that many
         rods holds a triple that is tried, and every seed of that triple is pursued whose predictions hit enough spots.
-        Where nothing is found, the search ends where so few rods could hardly be told from chance. Where something is
-        found, it goes on as long as an explanation of fewer rods, if it fits well, could come near: among the spots of
-        the best explanation, as twins of a pose share them, and among all spots where chance may bring one that could
-        be accepted. What was found is looked at once more from further triples of rods, for twins that one triple may
-        have missed: see docs/matching.md for how many of the poses a triple of rods finds. Where nothing acceptable was
-        found, further triples are tried too: the spots of the first may lie in a line.
+        Where nothing is found, the search ends where a match of so few rods could hardly be told from chance. Where
+        something is found, it goes on as long as an explanation of fewer rods, if it fits well, could come near: among
+        the spots of the best explanation, as twins of a pose share them, and among all spots where chance may bring one
+        that could be accepted. What was found is looked at once more from further triples of rods, for twins that one
+        triple may have missed: see docs/matching.md for how many of the poses a triple of rods finds. Where nothing
+        acceptable was found, further triples are tried too: the spots of the first may lie in a line.
         """
         spots, frame = problem.spots, problem.frame
         gains, apart = problem.gains, problem.decades_apart
@@ -127,7 +127,7 @@ class ByLevels:
 
         tried = None
         for level in search.levels:
-            # What matches of so many rods have to share with those of other numbers does not count here.
+            # Each number of rods is taken by itself here: it shares its allowance with no other.
             allowed = allowed_log10 - math.log10(share_of(level, len(problem.frame)))
             decades_left = allowed - search.least_false_alarms(level)
             if level < fewest or level * gains.max() < least_score or decades_left < 0:

@@ -27,11 +27,11 @@ _HALF_LINE_MM: Final = 0.75
 # How far the pieces of a spot lie from each other, mm per axis; shares of the unmatched spots that may be pieces.
 _PIECE_MM: Final = 2.0
 _PIECE_SHARES: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-# Pitches of a square lattice that are looked for, mm; a finer one is not told from none.
+# Pitches of a square lattice that are looked for, mm; a finer one cannot be told from no lattice at all.
 _FINEST_MM, _COARSEST_MM = 2.5, 25.0
 # Steps of wave number, as phases over the spots' extent; how far, as a share of the pitch, a spot may be off a hole.
 _PHASE_STEP, _OFF_HOLE = 0.4, 0.12
-# Expected number of lattices as marked among so many wave numbers in uniform spots, below which there is one.
+# Expected number of lattices as marked among all wave numbers tried in uniform spots, below which there is one.
 _LATTICE_BY_CHANCE: Final = 0.05
 # Of lattices followed by this share of the best one's strength, the coarsest is meant.
 _AS_WELL: Final = 0.7
@@ -227,5 +227,5 @@ def _by_chance(strength: float) -> float:
 
 
 def _is_crowded(count: int, expected: float) -> bool:
-    """Whether so many are significantly more than expected, by a Poisson law."""
+    """Whether `count` is significantly more than expected, by a Poisson law."""
     return bool(count > 0 and gammainc(count, expected) < _CROWDED)

@@ -276,7 +276,7 @@ def log10_false_alarms(
 
 
 def least_log10_false_alarms(inliers: int, spots: Spots, frame: Frame, prior: Prior) -> float:
-    """What `log10_false_alarms` of a true explanation of so many rods is hardly ever below."""
+    """What `log10_false_alarms` of a true explanation of `inliers` rods is hardly ever below."""
     variance_mm2 = _in_steps(_typical(np.sort(spots.variances_mm2)[:inliers]))
     ratio = low_stretch(frame, inliers, variance_mm2)
     chance = _chance(inliers, ratio, variance_mm2, spots, frame, prior)
@@ -284,7 +284,7 @@ def least_log10_false_alarms(inliers: int, spots: Spots, frame: Frame, prior: Pr
 
 
 def log10_by_chance(inliers: int, chi_square: float, spots: Spots, frame: Frame, prior: Prior) -> float:
-    """log10 of how many explanations of so many rods, with a chi-square this low, chance brings within the prior."""
+    """log10 of how many explanations of `inliers` rods, with a chi-square this low, chance brings within the prior."""
     ratio = plane_sample(frame, inliers).mean_ratio
     variance_mm2 = _typical(np.sort(spots.variances_mm2)[-inliers:])
     return log10_expected(inliers, chi_square, _chance(inliers, ratio, variance_mm2, spots, frame, prior))

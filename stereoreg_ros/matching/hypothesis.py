@@ -47,7 +47,7 @@ class Hypothesis:
 class Found:
     """What a search came to.
 
-    hypotheses: the explanations that the best one does not rule out, best first; none where there is none.
+    hypotheses: the explanations that the best one does not rule out, best first; empty where nothing was found.
     least_rods: explanations of fewer rods were not sought. given_up: why the search was ended early, else empty.
     is_near: whether only poses near the guess were sought.
     """

@@ -20,7 +20,7 @@ from stereoreg_ros.matching.consensus import (
 )
 from stereoreg_ros.matching.hypothesis import UNMATCHED, Hypothesis
 from stereoreg_ros.matching.problem import Problem
-from stereoreg_ros.matching.seeds import SeedSearch, Starts, joined, search_seeds
+from stereoreg_ros.matching.seeds import Starts, TripleSeeds, joined, seeds_of_triple
 from stereoreg_ros.matching.settling import settle, settle_as_matched
 from stereoreg_ros.matching.tables import SeedTables
 from stereoreg_ros.matching.triple_order import further_triples, triple_order
@@ -28,9 +28,9 @@ from stereoreg_ros.matching.twin_starts import starts_along_valley, starts_with_
 
 # Hypotheses refined at once: bounds the memory.
 _CHUNK: Final = 4000
-# Work after which a search is given up: some seconds. Only clutter takes so much. The unit is what a triple of spots
-# takes with six rods; so much more takes a start that is refined, with six rods and few spots, and the search of a
-# triple of rods by itself. From this share of it on, a search is not done once more.
+# Work after which a search is given up: some seconds, which only clutter takes. The unit is what one triple of spots
+# takes with six rods. _WORK_OF_START is that of a start that is refined, with six rods and few spots, _WORK_OF_SEARCH
+# that of searching a triple of rods at all. After the share _LONG of the work, a search is not done a second time.
 _MOST_WORK = 6_000_000
 _WORK_OF_START, _WORK_OF_SEARCH, _LONG = 40, 100_000, 0.1
 _FEW_SPOTS: Final = 30
@@ -55,14 +55,14 @@ class LevelSearch:
         self._spots, self._frame, self._prior = problem.spots, problem.frame, problem.prior
         self._tables = tables
         self._order = triple_order(problem.frame, problem.min_inliers)
-        self._searched: dict[tuple[int, int, int], list[SeedSearch]] = {}
+        self._searched: dict[tuple[int, int, int], list[TripleSeeds]] = {}
         self._searched_down_to: dict[tuple[int, int, int], int] = {}
         self._log10_false_alarms: dict[Hypothesis, float] = {}
         self._work = 0.0
 
     @property
     def is_long(self) -> bool:
-        """Whether so much has been done that the like once more would take too long."""
+        """Whether the search has taken so long that it must not be done a second time."""
         return self._work > _LONG * _MOST_WORK
 
     @property
@@ -82,15 +82,15 @@ class LevelSearch:
         return self._log10_false_alarms[hypothesis]
 
     def hopeless(self, level: int) -> bool:
-        """Whether even a true match of so many rods would hardly be told from chance."""
+        """Whether even a true match of `level` rods could hardly be told from chance."""
         return self.least_false_alarms(level) > self.problem.max_log10_false_alarms
 
     def least_false_alarms(self, level: int) -> float:
-        """log10 of the number of false alarms that a true match of so many rods is hardly ever below."""
+        """log10 of the number of false alarms that a true match of `level` rods is hardly ever below."""
         return least_log10_false_alarms(level, self._spots, self._frame, self._prior)
 
     def is_told_apart(self, level: int, best: Hypothesis, apart: float) -> bool:
-        """Whether chance brings matches of so many rods so much more often that they are no rivals of the best."""
+        """Whether matches of `level` rods come by chance so much more often that they do not rival the best."""
         return self.least_false_alarms(level) > self.false_alarms(best) + apart
 
     def has_rivals(self, level: int, chi_square: float) -> bool:
@@ -100,7 +100,7 @@ class LevelSearch:
         return log10_by_chance(level, chi_square, self._spots, self._frame, self._prior) > _LOG10_RIVALS
 
     def level(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Iterator[Hypothesis]:
-        """Explanations of so many rods, or more, besides the known; most_chi_square: see `SeedSearch.reaching`."""
+        """Explanations of `level` rods or more, besides the known; most_chi_square: see `TripleSeeds.reaching`."""
         for lines, complete_from in self._order:
             yield from self._from_triple(lines, level, most_chi_square, known)
             if complete_from <= level:
@@ -134,7 +134,7 @@ class LevelSearch:
     def second_look(
         self, level: int, known: list[Hypothesis], most_chi_square: float = math.inf, looks: int = LOOKS_AGAIN
     ) -> Iterator[Hypothesis]:
-        """Explanations of so many rods, or more, besides the known, from further triples of rods than `level` tried."""
+        """Explanations of `level` rods or more, besides the known, from triples of rods that `level` has not tried."""
         for starts in self._second_starts(level, known, most_chi_square, looks):
             yield from self._settled(starts)
 
@@ -193,13 +193,13 @@ class LevelSearch:
         if self._work > _MOST_WORK:
             raise SearchGivenUpError
 
-    def _seeds(self, lines: tuple[int, int, int], level: int) -> list[SeedSearch]:
+    def _seeds(self, lines: tuple[int, int, int], level: int) -> list[TripleSeeds]:
         """The seeds of the triple of rods where a slice may cut `level` rods or more."""
         down_to = self._searched_down_to.get(lines, len(self._frame) + 1)
         if level < down_to:
             self._spend(_WORK_OF_SEARCH)
             solver = self._tables.solver(lines, self._spots.sigma_mm)
-            search = search_seeds(self.problem, solver, (level, down_to - 1))
+            search = seeds_of_triple(self.problem, solver, (level, down_to - 1))
             self._spend(search.triples * len(self._frame) / 6)
             self._searched.setdefault(lines, []).append(search)
             self._searched_down_to[lines] = level

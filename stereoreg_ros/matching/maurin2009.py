@@ -82,7 +82,7 @@ def search(
     """Search the spots (s, 2) mm as fig. 5 says; noise_mm: sigma of s_d.
 
     Each of the N random sets of four spots is tried with every arrangement of four rods, so that one set free of
-    outliers, which eq. 27 is about, is enough. max_samples: stop after so many, to time a part of a long search.
+    outliers, which eq. 27 is about, is enough. max_samples: stop after this many, to time a part of a long search.
     """
     rng = np.random.default_rng(seed)
     started = time.perf_counter()

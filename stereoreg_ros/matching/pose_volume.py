@@ -26,20 +26,20 @@ from stereoreg_ros.geometry.visibility import END_SLACK_MM, may_show
 from stereoreg_ros.matching.prior import Near, Prior
 
 _LOG2_PLANES = 14
-# Of more sets of rods than this, so many are drawn.
+# Of more sets of rods than this, only this many are drawn.
 _MOST_SETS = 64
-# Of so many planes J'J is kept; and the percentage of them whose stretch is lower than the low one.
+# For how many planes J'J is kept; and the percentage of them whose stretch is lower than the low one.
 _FEW, _LOW = 400, 2.0
 # Stated as standard deviations: how far a position, in mm, or a rotation, in rad, is left open at most.
 _OPEN_POSITION_MM, _OPEN_ROTATION = 10.0, 0.1
-# Over so many turns of a quarter circle boxes are averaged.
+# Over how many turns of a quarter circle boxes are averaged.
 _TURNS = 6
-# Near a pose, spots within reach leave the slice's height so many reaches of room.
+# Near a pose, spots within reach leave the slice's height this many times the reach.
 _NEAR_HEIGHTS = 4.0
 
 
 def pose_volume(frame: Frame, rods: int, prior: Prior, area_mm2: float) -> float:
-    """Volume, mm^3 rad^3, of the poses within the prior that have the slice cut so many rods, over all sets of these.
+    """Volume, mm^3 rad^3, of the poses within the prior that have the slice cut `rods` rods, over all sets of these.
 
     area_mm2: of the slice, in which all the spots lie.
     """
@@ -53,9 +53,9 @@ def pose_volume(frame: Frame, rods: int, prior: Prior, area_mm2: float) -> float
 
 
 class PlaneSample(NamedTuple):
-    """Planes (p) in which a slice cuts so many rods of a frame.
+    """Planes (p) in which a slice cuts a given number of rods.
 
-    normals: (p, 3); sets: (p,), how many sets of so many rods each cuts; widths_mm, boxes_mm2: (p,), sums over these
+    normals: (p, 3); sets: (p,), how many sets of that many rods each cuts; widths_mm, boxes_mm2: (p,), sums over these
     sets of width and height together, and of width times height, of the box around the spots, averaged over turns;
     weight: volume that a plane stands for, mm rad^2 of the height and the normal. mean_ratio: of sqrt det J'J over
     planes and sets; squares: (m, 6, 6), J'J of some of them; J in mm per mm and per rad.
@@ -102,7 +102,8 @@ def plane_sample(frame: Frame, rods: int) -> PlaneSample:
 
 
 def typical_slices(frame: Frame, rods: int, most: int) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Up to `most` poses slice_from_frame (m, 3, 3), (m, 3) mm in which a slice cuts so many rods; and which (m, n)."""
+    """Up to `most` poses slice_from_frame (m, 3, 3), (m, 3) mm in which a slice cuts `rods` rods or more; which (m,
+    n)."""
     rotations, translations, _, _ = _planes(frame)
     visible = may_show(frame, cut(frame, rotations, translations))
     chosen = np.flatnonzero(visible.sum(axis=1) >= rods)[:most]
@@ -111,7 +112,7 @@ def typical_slices(frame: Frame, rods: int, most: int) -> tuple[Array, Array, ND
 
 def _planes(frame: Frame) -> tuple[Array, Array, Array, float]:
     """Poses slice_from_frame (p, 3, 3), (p, 3) mm with normals (p, 3) evenly over the sphere and heights evenly over
-    the frame, whose radius in mm is told too.
+    the frame, and the frame's radius in mm.
     """
     ends = np.concatenate([frame.starts, frame.ends])
     centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
@@ -148,7 +149,7 @@ def low_stretch(frame: Frame, rods: int, variance_mm2: float) -> float:
 
 
 def _sets_of(lines: int, rods: int) -> tuple[list[NDArray[np.intp]], float]:
-    """Sets of so many lines, and how many each stands for."""
+    """Sets of `rods` of the lines, and how many sets each stands for."""
     if comb(lines, rods) <= _MOST_SETS:
         return [np.array(one) for one in combinations(range(lines), rods)], 1.0
     rng = np.random.default_rng(0)

@@ -27,7 +27,7 @@ _LEAST_FLATNESS = 0.03
 _LEAST_DISTANCE_MM = 1e-3
 # What the first order may leave out of a squared distance.
 _FIRST_ORDER_SLACK = 10.0
-# A prediction of a larger variance, mm^2, is none: a rod that runs within the slice.
+# A prediction of a larger variance, mm^2, says nothing: its rod runs within the slice.
 _VAGUE_MM2 = 1e12
 # A seed so near an explanation (mm, and the rotation matrix's elements) leads to it.
 _SAME_MM, _SAME_ROTATION = 5.0, 0.1
@@ -65,7 +65,7 @@ def joined(starts: Sequence[Starts]) -> Starts:
     )
 
 
-class SeedSearch(NamedTuple):
+class TripleSeeds(NamedTuple):
     """The seeds of one triple of rods that hit enough spots, m of them, with every spot that each further rod may have.
 
     rotations (m, 3, 3), translations (m, 3) mm: slice_from_frame. spot_of_line: (m, n), the three spots of each seed.
@@ -73,7 +73,7 @@ class SeedSearch(NamedTuple):
     that seed that is predicted the sharpest, and so on; hit_squared: (h,), squared distance in standard deviations.
     nearest_hits: (m, n), spot_of_line with the nearest hit of every rod; nearest_squared: (m, k), its squared distance
     for each further rod. reach: (m,), three and the number of further rods that are hit: no consensus has more.
-    owed: (m,), rods that the slice must cut among the spots, and that are not hit.
+    unhit: (m,), rods that the slice must cut among the spots, and that are not hit.
     triples: how many were looked at.
     """
 
@@ -88,7 +88,7 @@ class SeedSearch(NamedTuple):
     nearest_hits: NDArray[np.intp]
     nearest_squared: Array
     reach: NDArray[np.intp]
-    owed: NDArray[np.intp]
+    unhit: NDArray[np.intp]
     triples: int
 
     def reaching(self, level: int, most_chi_square: float, known: list[Hypothesis]) -> Starts:
@@ -105,7 +105,7 @@ class SeedSearch(NamedTuple):
         # Each match alone, given the seed, brings its squared distance to chi-square, to first order.
         most_squared = most_chi_square + _FIRST_ORDER_SLACK
         wanted = (self.nearest_squared <= most_squared).sum(axis=1) >= level - 3
-        wanted &= 2 * MISSING_COST * self.owed <= most_chi_square
+        wanted &= 2 * MISSING_COST * self.unhit <= most_chi_square
         wanted &= ~self._leads_to(known)
         chosen = np.flatnonzero(
             (self.hit_rank == self.reach[self.hit_seed] - level)
@@ -135,10 +135,10 @@ class SeedSearch(NamedTuple):
         return leads
 
 
-def search_seeds(problem: Problem, solver: ThreeRodSolver, rods_cut: tuple[int, int]) -> SeedSearch:
+def seeds_of_triple(problem: Problem, solver: ThreeRodSolver, rods_cut: tuple[int, int]) -> TripleSeeds:
     """The seeds of the solver's rods within the prior, and what they hit.
 
-    rods_cut: only where a slice may cut so many rods, at least and at most. Only seeds that hit enough for a consensus
+    rods_cut: how many rods the slice may cut, the least and the most. Only seeds that hit enough for a consensus
     of the fewest rods are kept.
     """
     spots, frame, prior = problem.spots, problem.frame, problem.prior
@@ -360,7 +360,7 @@ def _kept(
     seeds: Seeds,
     sure: NDArray[np.bool_],
     hits: _Hits,
-) -> SeedSearch:
+) -> TripleSeeds:
     """The seeds that hit enough rods, with their hits in order."""
     frame, min_inliers, others = problem.frame, problem.min_inliers, _others(problem.frame, solver)
     gate = np.full((own_spots.shape[1], len(others)), np.inf)
@@ -378,7 +378,7 @@ def _kept(
     nearest_hits[hit_seed[farthest_first], hit_line[farthest_first]] = hits.spot[farthest_first]
     nearest_squared = np.full((len(rows), len(others)), np.inf)
     nearest_squared[hit_seed[farthest_first], hits.other[farthest_first]] = hits.squared[farthest_first]
-    return SeedSearch(
+    return TripleSeeds(
         *solver.poses(seeds.lambdas[rows], problem.spots.mm[own_spots[:, rows].T]),
         spot_of_line,
         hit_seed,
@@ -394,7 +394,7 @@ def _kept(
     )
 
 
-def _merged(pieces: list[SeedSearch]) -> SeedSearch:
+def _merged(pieces: list[TripleSeeds]) -> TripleSeeds:
     if len(pieces) == 1:
         return pieces[0]
     before = np.cumsum([0, *(len(piece.reach) for piece in pieces[:-1])]).tolist()
@@ -402,7 +402,7 @@ def _merged(pieces: list[SeedSearch]) -> SeedSearch:
     def joined(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(piece, name) for piece in pieces])
 
-    return SeedSearch(
+    return TripleSeeds(
         joined("rotations"),
         joined("translations"),
         joined("spot_of_line"),
@@ -414,6 +414,6 @@ def _merged(pieces: list[SeedSearch]) -> SeedSearch:
         joined("nearest_hits"),
         joined("nearest_squared"),
         joined("reach"),
-        joined("owed"),
+        joined("unhit"),
         sum(piece.triples for piece in pieces),
     )

@@ -44,7 +44,7 @@ class Chance:
 
 
 def log10_expected(inliers: int, chi_square: float, chance: Chance) -> float:
-    """log10 of the expected number of matches by chance of so many rods, with a chi-square this low."""
+    """log10 of the expected number of matches of `inliers` rods by chance, with a chi-square this low."""
     further = inliers - 3
     if inliers > chance.spots or chance.measure_mm6 <= 0:
         return -math.inf
@@ -59,7 +59,7 @@ def log10_expected(inliers: int, chi_square: float, chance: Chance) -> float:
 
 
 def lucky_chi_square(inliers: int) -> float:
-    """Chi-square that a true match of so many rods is hardly ever below: once in a hundred."""
+    """Chi-square that a true match of `inliers` rods is hardly ever below: once in a hundred."""
     return 2 * float(gammaincinv(inliers - 3, _LUCK))
 
 
@@ -84,7 +84,7 @@ def area_of_uniform_mm2(spots_mm: Array, slice_area_mm2: float | None) -> float:
 
 
 def share_of(inliers: int, lines: int) -> float:
-    """Share of the allowed false alarms that matches of so many of the frame's rods get; all shares sum to one.
+    """Share of the allowed false alarms that matches of `inliers` of the frame's rods get; all shares sum to one.
 
     From five rods on each number gets an eighth of the one below: each rod more makes chance matches a thousand times
     rarer, so that less of the allowance is needed. Four rods have but one to confirm them and can hardly ever be told

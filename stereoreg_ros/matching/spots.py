@@ -147,7 +147,7 @@ class Spots(NamedTuple):
         return whitening_of(self.match_covariances(frame, cuts, spot_of_line))
 
     def common(self, frame: Frame, cuts: Cuts, spot_of_line: NDArray[np.intp], used: NDArray[np.bool_]) -> Array | None:
-        """Errors that spots share, as `solvers.maximum_likelihood.refine` takes them; None where there are none."""
+        """Errors that spots share, as `solvers.maximum_likelihood.refine` takes them; None where all are zero."""
         shared = self.tolerances.common(frame, cuts, self.mm[spot_of_line], used)
         return shared if shared.any() else None
 

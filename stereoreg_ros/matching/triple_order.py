@@ -23,7 +23,7 @@ _STEPS = 24
 class RankedTriple(NamedTuple):
     """A triple of rods, and what has been covered once it and all before it were tried.
 
-    complete_from: every set of at least so many rods that any triple can solve holds a triple tried by then.
+    complete_from: every set of at least that many rods that any triple can solve holds a triple tried by then.
     """
 
     lines: tuple[int, int, int]

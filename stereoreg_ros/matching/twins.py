@@ -30,7 +30,7 @@ _KEPT: Final = 64
 
 
 class TwinSample:
-    """Typical slices that show so many rods, and whether any of them has a second explanation of them all."""
+    """Typical slices that show a given number of rods, and whether any of them has a second explanation of them all."""
 
     def __init__(self, tables: SeedTables, rods: int, sigma_mm: float) -> None:
         self._tables, self._rods, self._sigma_mm = tables, rods, sigma_mm
@@ -41,13 +41,13 @@ class TwinSample:
         self._looking = Lock()
 
     def any(self) -> bool:
-        """Whether a slice was found that has twins; true too where no slice shows so many rods."""
+        """Whether a slice was found that has twins; true too where no slice shows that many rods."""
         while not self._twins and self.look_at_next():
             pass
         return self._twins > 0 or not self._looked_at
 
     def look_at_next(self) -> bool:
-        """Look at one slice more; False where there is none."""
+        """Look at one more slice; False where none is left."""
         with self._looking:
             try:
                 rotation, translation, seen = next(self._left)

@@ -130,11 +130,11 @@ def section(result: CalibrationAccuracy) -> Section:
             scale_error <= paper.SCALE_ERROR,
         )
     )
-    text = f"""Eight rods (`{EIGHT_RODS.name}`, coordinates below), scale 0.5 mm/pixel and pose both unknown,
-{result.poses} random poses per level of noise, new ones at each. LS is the linear solution (eq. 10-12), N-R adds
-l1 . l2 = 0 (eq. 17-23), ML is the least-squares fit in the image. N-R adds one constraint to nine unknowns, so its
-gain over LS is small. The scale is as good as the rods are far apart: the bound says what this frame of 60 mm
-allows, the paper's was perhaps wider."""
+    text = f"""Eight rods (`{EIGHT_RODS.name}`, coordinates below), scale 0.5 mm/pixel; scale and pose are both
+unknown. There are {result.poses} random poses per noise level, drawn anew at each level. LS is the linear solution
+(eq. 10-12), N-R adds l1 . l2 = 0 (eq. 17-23), ML is the least-squares fit in the image. N-R adds one constraint to
+nine unknowns, so its gain over LS is small. How well the scale is determined depends on how far apart the rods are:
+the bound shows what this 60 mm frame allows; the paper's frame was perhaps wider."""
     return Section(
         "Calibration with eight rods: figs 6 and 7",
         text,

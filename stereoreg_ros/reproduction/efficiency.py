@@ -114,9 +114,9 @@ def section(results: list[Efficiency], poses: int) -> Section:
         for one in results
         if one.method == "ML"
     ]
-    text = f"""Not in the paper. {poses} random poses with noise uniform in +-{paper.NOISE_PX:g} pixel, the first
-4, 5, 6, 8 rods of `{EIGHT_RODS.name}`. Efficiency is bound variance / measured variance: one over the mean of
-|error|^2 / trace(bound), each pose with the bound at its own truth. The Cramer-Rao bound here and in the plots is
-that of Gaussian noise with the variance of the uniform noise; it is of first order, so at finite noise a value a
-little off 1 means curvature."""
+    text = f"""Not in the paper. {poses} random poses with noise uniform in +-{paper.NOISE_PX:g} pixel, the first 4,
+5, 6, 8 rods of `{EIGHT_RODS.name}`. Efficiency is bound variance / measured variance: one over the mean of
+|error|^2 / trace(bound), with the bound of each pose taken at its true value. The Cramer-Rao bound here and in the
+plots is that of Gaussian noise with the variance of the uniform noise. It is a first-order bound, so at finite
+noise a value slightly off 1 indicates curvature."""
     return Section("Efficiency at 0.5 pixel", text, comparisons, (table,), (table,))

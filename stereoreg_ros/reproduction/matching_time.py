@@ -200,18 +200,19 @@ def section(results: list[MatchingTime]) -> Section:
         ("spots", "false", "method", "median / s", "least / s", "greatest / s", "runs", "right", "wrong", "time"),
         rows,
     )
-    text = f"""Six rods (`{FIRST_CUBE.name}`), noise uniform in +-{paper.NOISE_PX:g} pixel, false spots uniform
-over 512 x 512 pixels, poses as above; the same sets of spots for every method. The paper's seconds are of a
-Pentium IV at 2.8 GHz, ours of the machine and Python named above: compare the growth with the number of false
-spots, and `maurin2009` with `three_line`, which ran on the same machine. `maurin2009` is fig. 5 as published (its
-s_d three times the spots' noise: a right spot is off by mostly the error of a pose from four spots), `three_line`
-the whole of `register_spots`, decision included. "Right" means that every rod named is on its true spot; a run
-that is neither right nor wrong had no answer: no sample qualified, or `three_line` refused. That is how many runs
-of `maurin2009` end here: N of eq. 27 asks for one set of spots without an outlier, and from one such set at this
-noise the four-spot pose often does not find a fifth rod; sets that s_c turns down count among the N, and with this
-cube few of four spots pass sin 20, so that short times are those of searches that tried next to nothing. A time is
-extrapolated where the planned samples N (eq. 27, times the arrangements of four rods) do not fit the time set for
-a cell: some are run, and their time is multiplied by planned over run."""
+    text = f"""Six rods (`{FIRST_CUBE.name}`), noise uniform in +-{paper.NOISE_PX:g} pixel, false spots uniform over
+512 x 512 pixels, poses as above, and the same sets of spots for every method. The paper's times are from a Pentium
+IV at 2.8 GHz, ours from the machine and Python named above. So compare how they grow with the number of false
+spots, and compare `maurin2009` with `three_line`, which ran on the same machine. `maurin2009` is fig. 5 as
+published, with s_d three times the spots' noise, because the distance of a true spot is mostly the error of a pose
+from four spots. `three_line` is the whole of `register_spots`, including the decision. "Right" means that every rod
+named is on its true spot. A run that is neither right nor wrong gave no answer: no sample qualified, or
+`three_line` refused. Many runs of `maurin2009` end this way, for two reasons. N of eq. 27 asks for one set of spots
+without an outlier, but at this noise the four-spot pose from such a set often does not find a fifth rod. And sets
+rejected by s_c count among the N; with this cube few sets of four spots pass sin 20, so short times are those of
+searches that tried next to nothing. A time is extrapolated if the planned number of samples N (eq. 27, times the
+arrangements of four rods) does not fit the time allowed for a cell: some samples are run, and their time is
+multiplied by planned over run."""
     return Section(
         "Time of the automatic matching: table 2",
         text,

@@ -135,10 +135,10 @@ def section(results: list[PoseAccuracy]) -> Section:
         name = f"figure_{figure}_pose_{result.lines}_lines.png"
         figures.append((name, f"Mean errors of the pose from {result.lines} rods against the amplitude of the noise"))
     text = f"""The first four and all eight rods of `{EIGHT_RODS.name}` (coordinates below), {results[0].poses}
-random poses per level. Of several solutions a method's own first counts. A failure is no solution, or one that did
-not converge; failures are left out of the means. The closed forms now and then go far wrong at a pose where the
-constraints they use hardly depend on the unknown that is left open, LS-SVD (DR) by dividing by numbers near zero:
-the medians tell. With four rods LS-SVD and LS-TZ are the same solution."""
+random poses per level. If a method returns several solutions, the one it ranks first counts. A failure is no
+solution, or one that did not converge; failures are excluded from the means. The closed forms occasionally go far
+wrong at a pose where their constraints hardly depend on the remaining unknown, LS-SVD (DR) because it divides by
+numbers near zero: compare the medians. With four rods LS-SVD and LS-TZ are the same solution."""
     return Section(
         "Pose with known scale: figs 8 and 9", text, comparisons, tuple(tables), tuple(shown), tuple(figures)
     )

@@ -151,13 +151,13 @@ def section(by_rail: dict[str, list[Prediction]]) -> Section:
         ),
         rows,
     )
-    text = f"""The same slices with six lines. Each cube's registration and the known offset predict the other
-one's spots; the boxes hold them if no spot of the registered cube is off by more than {paper.SPOT_ERROR_PX:g}
-pixel in any coordinate (closed form over a box, through the sensitivity of the maximum-likelihood pose). A bound
-is half a box's longer side. The spots found in rendered slices are good to about 0.02 pixel, so that they lie far
-inside. A box supposes that all twelve coordinates are off by their most and in the worst combination; how large it
-is depends on the frame, and the smaller the cube, the larger the box 118 mm away. The paper does not say whether
-its 2 mm are half a side or a whole one."""
+    text = f"""The same slices with six rods. The registration of each cube and the known offset predict the spots
+of the other. The boxes contain these spots if no spot of the registered cube is off by more than
+{paper.SPOT_ERROR_PX:g} pixel in any coordinate (closed form over a box, through the sensitivity of the
+maximum-likelihood pose). A bound is half the longer side of a box. The spots found in rendered slices are accurate
+to about 0.02 pixel, so they lie well inside. A box assumes that all twelve coordinates are off by the maximum and
+in the worst combination. Its size depends on the frame: the smaller the cube, the larger the box 118 mm away. The
+paper does not say whether its 2 mm are half a side or a whole one."""
     return Section(
         "Rods of one cube predicted from the other: fig. 12",
         text,

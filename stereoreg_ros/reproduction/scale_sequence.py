@@ -101,10 +101,10 @@ def section(result: ScaleSequence) -> Section:
         ]
     text = f"""{result.slices} rendered slices (`{FIRST_CUBE.name}`, six rods, in its block, with a patient; 512 x
 512 pixels of {SETTINGS.scale.sx:g} mm, slices of {SETTINGS.slice_thickness_mm:g} mm, noise {SETTINGS.noise_hu:g}
-HU), the cube tilted by the rotation vector {TILT} rad and moved by {TRAVEL_MM:g} mm in all. Spots by `find_spots`,
-matches by `register_slice`, then the scale from each slice alone against the spacing it was rendered with;
-{len(result.numbers)} of {result.slices} slices gave all six rods. The paper's real slices have what these have
-not: a rail and a table, a detector, rods that are straight to 10 um."""
+HU); the cube is tilted by the rotation vector {TILT} rad and moves by {TRAVEL_MM:g} mm in all. Spots come from
+`find_spots` and matches from `register_slice`; then the scale from each slice alone is compared with the spacing it
+was rendered with. {len(result.numbers)} of {result.slices} slices gave all six rods. The paper's real slices have
+what these lack: a rail and a table, a detector, rods that are straight to 10 um."""
     return Section(
         "Scale from a sequence: fig. 10",
         text,

@@ -198,16 +198,16 @@ def section(results: list[RailOffsets]) -> Section:
         by_slice,
     )
     count = results[0].slices
-    text = f"""{count} slices of a helical sequence with two cubes of six rods (coordinates below), the second
-one's origin at {paper.RAIL_OFFSET_MM} mm in the first one's axes, their orientations the same. The rail is turned
-by the rotation vector {RAIL_ROTATION} rad; the table moves during each slice, which thickens it to
-{np.hypot(0.5, 0.5):.2f} mm. Both cubes are registered from each slice by the whole chain, `register_frames` from
-image to matches, to each cube the other one's spots being false; then each method finds both poses from the
-matches, and the table holds the second cube's origin in the first one's axes: errors of the first cube's rotation
-count with a lever of 118 mm. Five lines: one rod is hidden in both cubes. The paper's cubes have rods of 30 mm:
-the 30 mm cubes are ours at half the size (their rods 30 to 41 mm), the 60 mm cubes have twice the lever. ML stands
-beside the paper's N-R. With six lines "as good" asks more of N-R and ML than the paper's figures: mean errors of
-at most {WANTED_MEAN_MM:g} mm, sigma at most a third of the paper's."""
+    text = f"""{count} slices of a helical sequence with two cubes of six rods (coordinates below); the origin of
+the second is at {paper.RAIL_OFFSET_MM} mm in the axes of the first, and their orientations are the same. The rail
+is turned by the rotation vector {RAIL_ROTATION} rad; the table moves during each slice, which thickens it to
+{np.hypot(0.5, 0.5):.2f} mm. Both cubes are registered from each slice by the whole chain, `register_frames`, from
+image to matches; for each cube the spots of the other are false. Then each method computes both poses from the
+matches, and the table gives the origin of the second cube in the axes of the first: rotation errors of the first
+cube act with a lever arm of 118 mm. Five lines: one rod is hidden in both cubes. The paper's cubes have rods of 30
+mm. The 30 mm cubes are ours at half the size (their rods 30 to 41 mm); the 60 mm cubes have twice the lever arm. ML
+stands beside the paper's N-R. With six lines, "as good" demands more of N-R and ML than the paper's figures: mean
+errors of at most {WANTED_MEAN_MM:g} mm, and sigma at most a third of the paper's."""
     return Section(
         "Two cubes on a rail: table 1 and fig. 13",
         text,

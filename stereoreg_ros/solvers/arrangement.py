@@ -40,8 +40,10 @@ class DegenerateArrangementError(ValueError):
             by_name.setdefault(one.name, []).append(one)
         self.names = tuple(by_name) or ("ill_conditioned",)
         self.condition = condition
-        told = [str(alike[0]) + (f" and {len(alike) - 1} more" if len(alike) > 1 else "") for alike in by_name.values()]
-        found = "; ".join(told) or "no arrangement of section 3.1"
+        listed = [
+            str(alike[0]) + (f" and {len(alike) - 1} more" if len(alike) > 1 else "") for alike in by_name.values()
+        ]
+        found = "; ".join(listed) or "no arrangement of section 3.1"
         super().__init__(f"degenerate: {found}; the system has condition number {condition:.3g}")
 
 

@@ -150,16 +150,16 @@ class PoseErrorModel(LinearErrorModel):
         arm_change = most.arm_change + remainder
         # 1 - J_0 G is a projection where lengths are measured by W: no shift of the spots leaves more than itself.
         root = np.linalg.norm(self._root, ord=2, axis=(1, 2))
-        yielded = root * [reach.forced(rows) for rows in self._jacobian]
+        carried = root * [reach.forced(rows) for rows in self._jacobian]
         moved = np.linalg.norm(first.shifts + root * reach.beyond.remainder)
-        tension = first.tension + float(moved) + float(np.linalg.norm(yielded))
+        tension = first.tension + float(moved) + float(np.linalg.norm(carried))
         return _Beyond(remainder, slope_change * root * tension, arm_change * stretch * root * tension)
 
     def follows(self, functional: Array, by_spot: Array) -> float:
         """A bound of |functional @ G p| for shifts p of the spots of lengths by_spot (n,) mm."""
         return float(np.linalg.norm(functional @ self._gain, ord=2, axis=(1, 2)) @ by_spot)
 
-    def gives_way(self, functional: Array, by_slope: Array, by_arm: Array) -> float:
+    def bound_by_residuals(self, functional: Array, by_slope: Array, by_arm: Array) -> float:
         """A bound of |functional @ H^-1 (J - J_0)'W r|: J_i'f is the force F = (f, -slope f) and the moment arm x F."""
         by_force = functional @ self._inverse
         lift = (by_force[:, :3] + by_force[:, 3:] @ skew(self._arms))[..., 2]
@@ -210,7 +210,7 @@ class _Beyond(NamedTuple):
 
 
 class Reach:
-    """How far the pose can be carried by errors within the box of which `PoseErrorModel.reach` was told."""
+    """How far the pose can be carried by errors within the box that `PoseErrorModel.reach` was given."""
 
     def __init__(self, model: PoseErrorModel, max_error_px: float, beyond: _Beyond) -> None:
         self._model, self._max_error_px, self.beyond = model, max_error_px, beyond
@@ -232,4 +232,4 @@ class Reach:
 
     def forced(self, functional: Array) -> float:
         """What of the bound comes from the Jacobian's change under the residuals."""
-        return self._model.gives_way(functional, self.beyond.by_slope, self.beyond.by_arm)
+        return self._model.bound_by_residuals(functional, self.beyond.by_slope, self.beyond.by_arm)

@@ -146,7 +146,7 @@ class ThreeRodSolver:
         return near
 
     def table(self, least_rods: int, most_rods: int) -> DistanceTable:
-        """From distances to the cells in which a slice may cut so many rods, from the least to the most."""
+        """From distances to the cells in which a slice may cut from `least_rods` to `most_rods` rods."""
         key = (least_rods, most_rods)
         if key not in self._tables:
             cells = np.flatnonzero((self.rods_cut >= least_rods) & (self.rods_cut <= most_rods))

@@ -27,7 +27,7 @@ from stereoreg_ros.spots.regions import Regions, parted
 _MOST_PEAKS, _MOST_PIXELS, _LEAST_PEAKS = 512, 2_000_000, 32
 # So many pixels of squares are looked at together.
 _AT_ONCE: Final = 1_000_000
-# What a square cuts off is looked at in one so many radii to each side.
+# What a square cuts off is looked at in one that reaches this many radii to each side.
 _LONGER: Final = 1.5
 # What stands out by less than this share of its rough height, and is larger than this share of the largest spot, is the
 # top of something larger.

@@ -28,10 +28,10 @@ _REACH, _RING_INNER, _RING_OUTER = 2, 3, 5
 # Patches are square, of one of these sides, so that spots of about one size are centred at once.
 _SIDES: Final = (13, 19, 27, 39, 55, 101)
 _MARGIN: Final = 4
-# A centre that is not known to a pixel is none: what it belongs to looks little like a rod.
+# A spot whose centre is not known to a pixel is left out: it looks little like a rod.
 _LARGEST_STD_PX: Final = 0.8
 _ROUNDING_PX2: Final = 1e-9
-# So many times it is chosen anew where things without a centre were among the chosen.
+# How often the choice is repeated where things without a centre were among the chosen.
 _CHOICES: Final = 4
 
 
@@ -135,7 +135,7 @@ def _measured(hu: NDArray[np.float32], regions: Regions, side: int) -> _Measured
 
 
 def _dilated(masks: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Masks (n, p, p) grown by so many pixels; one below the other they are one picture to OpenCV."""
+    """Masks (n, p, p) grown by `reach` pixels; stacked, they are one picture to OpenCV."""
     count, side = masks.shape[:2]
     picture = np.zeros((count, side + reach, side), dtype=np.uint8)
     picture[:, :side] = masks

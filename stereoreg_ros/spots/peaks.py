@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-# A peak is the highest of so many pixels to a side.
+# A peak is the highest within this many pixels to each side.
 _SIDE: Final = 5
 # What varies by less is flat, HU.
 _FLAT_HU: Final = 1.0
@@ -69,7 +69,7 @@ def find_peaks(smooth: NDArray[np.float32], margin: int, radius: int, least: flo
 
 
 def _highest(height: NDArray[np.float32], most: int) -> NDArray[np.intp]:
-    """Rows of the highest, so many at most."""
+    """Rows of the highest, `most` at most."""
     return np.argpartition(-height, most)[:most] if len(height) > most else np.arange(len(height))
 
 

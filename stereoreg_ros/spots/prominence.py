@@ -21,7 +21,7 @@ _HIGHEST, _STEPS = 4 / 3, 6
 _LITTLE: Final = 1 / 2
 # Pixels so far apart along a row or a column, and along a diagonal, do not share their noise.
 _LAG, _DIAGONAL_LAG = 3, 2
-# Of every so many rows of the slice, and of every so many rows and columns of a square, differences are taken.
+# Differences are taken of every n-th row of the slice, and of every n-th row and column of a square.
 _ROWS, _EVERY = 32, 3
 # Median absolute difference of two normal variables, of their standard deviation.
 _MEDIAN_OF_DIFFERENCES: Final = 0.954
@@ -71,7 +71,7 @@ def least_height(noise: float) -> float:
 def prominences(smooth: SmoothSlice, peaks: Peaks, reach: int, most: float) -> Prominence:
     """How far peaks stand out: down to the lowest level at which each is a thing by itself.
 
-    That is, the region around it has at most so many pixels, all within `reach` columns and rows and none at the edge
+    That is, the region around it has at most `most` pixels, all within `reach` columns and rows and none at the edge
     of the slice, and nothing in it is higher.
     """
     squares = _squares(smooth, peaks, reach)

@@ -304,7 +304,7 @@ class TestRefused:
 
     def test_too_few_spots(self, cube: Frame) -> None:
         few = [seen(np.random.default_rng(0).uniform(0, 500, (4, 2)))] * 3
-        assert "5 rods are needed, and none of 3 slices has so many spots" in self.refusal(few, cube, TRUE).message
+        assert "5 rods are needed, and none of 3 slices has that many spots" in self.refusal(few, cube, TRUE).message
 
     def test_four_rods(self) -> None:
         rng = np.random.default_rng(32)

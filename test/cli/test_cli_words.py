@@ -15,7 +15,7 @@ from stereoreg_ros import RegistrationOptions, cli, load_frame
 from stereoreg_ros.calibration.calibrate import Calibration
 from stereoreg_ros.calibration.series import SeriesScale, SliceScale
 from stereoreg_ros.cli.inspect import USED_OPTIONS
-from stereoreg_ros.frames.design_search import Wish
+from stereoreg_ros.frames.design_search import Requirements
 from stereoreg_ros.frames.expected_error import Imaging
 from stereoreg_ros.frames.proposal import Proposal
 from stereoreg_ros.geometry.pose import Pose, rotation_exp
@@ -337,14 +337,14 @@ class TestDesign:
 
     def test_all_options_are_passed_on(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         assert self.call(monkeypatch, tmp_path, *self.FLAGS) == 0
-        wish, *others = self.asked
-        assert isinstance(wish, Wish)
-        assert (wish.envelope.size_mm, wish.envelope.gap_mm) == ((30.0, 40.0, 80.0), 2.5)
-        assert wish.diameters_mm == (0.5,) * 5
-        assert wish.imaging == Imaging.of(PixelScale(0.4, 0.7), OPTIONS)
-        assert wish.target_mm == (1.0, -2.0, 3.0)
+        requirements, *others = self.asked
+        assert isinstance(requirements, Requirements)
+        assert (requirements.envelope.size_mm, requirements.envelope.gap_mm) == ((30.0, 40.0, 80.0), 2.5)
+        assert requirements.diameters_mm == (0.5,) * 5
+        assert requirements.imaging == Imaging.of(PixelScale(0.4, 0.7), OPTIONS)
+        assert requirements.target_mm == (1.0, -2.0, 3.0)
         # By default a quarter of the box's height.
-        assert (wish.largest_tilt_deg, wish.largest_height_mm) == (12.0, 20.0)
+        assert (requirements.largest_tilt_deg, requirements.largest_height_mm) == (12.0, 20.0)
         assert others == ["mine", OPTIONS, 3, 7]
 
     @pytest.mark.parametrize("height", [0.0, 7.5])
@@ -358,7 +358,7 @@ class TestDesign:
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         assert self.call(monkeypatch, tmp_path, *self.FLAGS, "--height", "0") == 0
-        wish, *others = self.asked
+        requirements, *others = self.asked
         lines = [line[2:] for line in (tmp_path / "mine.yaml").read_text().splitlines() if line.startswith("# ")]
         assert lines[0].startswith("6 rods; 95 % target error 0.250 mm over the requested slices")
         assert "0 of 20 spot sets ambiguous" in lines[0]
@@ -368,8 +368,12 @@ class TestDesign:
         assert self.call(monkeypatch, tmp_path, *called[2:]) == 0
         again = self.asked[0]
         assert self.asked[1:] == tuple(others)
-        assert (again.envelope, again.diameters_mm, again.imaging) == (wish.envelope, wish.diameters_mm, wish.imaging)
-        assert (again.target_mm, again.largest_tilt_deg, again.largest_height_mm) == (wish.target_mm, 12.0, 0.0)
+        assert (again.envelope, again.diameters_mm, again.imaging) == (
+            requirements.envelope,
+            requirements.diameters_mm,
+            requirements.imaging,
+        )
+        assert (again.target_mm, again.largest_tilt_deg, again.largest_height_mm) == (requirements.target_mm, 12.0, 0.0)
 
     def test_an_ambiguous_frame_is_written_and_complained_of(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]

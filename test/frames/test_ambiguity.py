@@ -12,7 +12,7 @@ import pytest
 
 from stereoreg_ros import PixelScale, Refusal, Registration, RegistrationOptions, load_frame
 from stereoreg_ros.frames.ambiguity import Trial, reasons, trials
-from stereoreg_ros.frames.meeting import MIDDLE_MM, Meetings
+from stereoreg_ros.frames.slice_poses import MIDDLE_MM, SlicePoses
 from stereoreg_ros.geometry.pose import Array, Pose, rotation_exp
 from stereoreg_ros.geometry.projection import project
 from stereoreg_ros.geometry.spots import SliceSpots
@@ -25,9 +25,9 @@ TURN = rotation_exp(np.array([0.1, -0.05, 0.4]))
 TRUTH = Pose(TURN, np.array([*MIDDLE_MM, 2.0]))
 
 
-def meeting(count: int = 1) -> Meetings:
+def meeting(count: int = 1) -> SlicePoses:
     nothing = np.zeros(count)
-    return Meetings(np.tile(TRUTH.rotation, (count, 1, 1)), np.tile(TRUTH.translation, (count, 1)), nothing, nothing)
+    return SlicePoses(np.tile(TRUTH.rotation, (count, 1, 1)), np.tile(TRUTH.translation, (count, 1)), nothing, nothing)
 
 
 class Registering:

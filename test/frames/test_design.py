@@ -18,13 +18,13 @@ from stereoreg_ros.frames import ambiguity as ambiguity_module
 from stereoreg_ros.frames import design_search as search_module
 from stereoreg_ros.frames import proposal as proposal_module
 from stereoreg_ros.frames.ambiguity import trials
-from stereoreg_ros.frames.design_search import Wish, random_layouts, search
+from stereoreg_ros.frames.design_search import Requirements, random_layouts, search
 from stereoreg_ros.frames.expected_error import Imaging
 from stereoreg_ros.frames.inspection import inspect_frame
 from stereoreg_ros.frames.inspection_table import table_of
 from stereoreg_ros.frames.layouts import Envelope, Layouts, gaps
-from stereoreg_ros.frames.meeting import meetings
 from stereoreg_ros.frames.proposal import propose
+from stereoreg_ros.frames.slice_poses import slice_poses
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.projection import cut, rod_covariances
 
@@ -34,7 +34,7 @@ OPTIONS = RegistrationOptions(slice_thickness_mm=1.0, target_in_frame_mm=(0.0, 1
 PERFECT = replace(OPTIONS, frame_tolerance_mm=0.0, scale_tolerance=0.0, max_target_error_mm=1000.0)
 
 
-def wish(rods: int = 6, **changes: Any) -> Wish:
+def requirements(rods: int = 6, **changes: Any) -> Requirements:
     asked: dict[str, Any] = {
         "envelope": Envelope((60.0, 60.0, 60.0), 5.0),
         "diameters_mm": (1.0,) * rods,
@@ -43,7 +43,7 @@ def wish(rods: int = 6, **changes: Any) -> Wish:
         "largest_tilt_deg": 30.0,
         "largest_height_mm": 15.0,
     }
-    return Wish(**(asked | changes))
+    return Requirements(**(asked | changes))
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("quick")
 class TestSearch:
     def test_better_than_the_best_of_many_random_layouts(self) -> None:
-        asked = wish()
+        asked = requirements()
         found = search(asked, seed=1, chains=1)[0]
         layouts = asked.envelope.layouts(found.corners[None], asked.diameters_mm)
         assert gaps(layouts).min() >= 5.0
@@ -69,7 +69,7 @@ class TestSearch:
         assert found.target_error_95_mm < asked.costs(drawn).min()
 
     def test_seeded(self) -> None:
-        again = [search(wish(4), seed, chains=1)[0].corners for seed in (1, 1, 2)]
+        again = [search(requirements(4), seed, chains=1)[0].corners for seed in (1, 1, 2)]
         np.testing.assert_array_equal(again[0], again[1])
         assert not np.array_equal(again[0], again[2])
 
@@ -83,13 +83,13 @@ class TestSearch:
                 raise KeyboardInterrupt
             return False
 
-        found = search(wish(4), seed=3, chains=50, progress=stop)[0]
+        found = search(requirements(4), seed=3, chains=50, progress=stop)[0]
         assert found.interrupted
         assert len(told) == 1
         assert found.target_error_95_mm == pytest.approx(told[0], abs=0.01)
 
     def test_rods_that_have_no_room(self) -> None:
-        crowded = wish(20, envelope=Envelope((10.0, 10.0, 10.0), 9.0), largest_height_mm=2.0)
+        crowded = requirements(20, envelope=Envelope((10.0, 10.0, 10.0), 9.0), largest_height_mm=2.0)
         with pytest.raises(ValueError, match="of 20 rods with 9 mm between them hardly any fits into 10 x 10 x 10 mm"):
             search(crowded, seed=0, chains=1)
 
@@ -105,10 +105,10 @@ class TestSearch:
     )
     def test_wrong_wishes(self, changes: dict[str, Any], told: str) -> None:
         with pytest.raises(ValueError, match=told):
-            wish(**changes)
+            requirements(**changes)
 
     def test_a_proposal_is_tried_with_each_rod_missing(self) -> None:
-        made = propose(wish(), "mine", PERFECT, seed=4, chains=1)
+        made = propose(requirements(), "mine", PERFECT, seed=4, chains=1)
         assert made.frame.name == "mine"
         assert made.ambiguous == 0
         assert made.tried == 7 * 8
@@ -197,7 +197,7 @@ class TestInspection:
 
     def test_trials_see_a_missing_rod(self) -> None:
         frame = load_frame("cube6")
-        poses = meetings(3, 0, np.zeros(3), np.array([0.0, 0.0]), 5.0)
+        poses = slice_poses(3, 0, np.zeros(3), np.array([0.0, 0.0]), 5.0)
         made = list(trials(frame, poses, SCALE, PERFECT, [None, 2], np.random.default_rng(0)))
         assert [trial.left_out for trial in made] == [None, 2] * 3
         assert all(not trial.reason and trial.right and not trial.twins for trial in made)
@@ -205,7 +205,7 @@ class TestInspection:
     def test_trials_are_of_frames_and_scales_within_the_tolerance(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """The spots that the registration is given, over many trials of one pose."""
         frame, options = load_frame("cube6"), replace(OPTIONS, frame_tolerance_mm=0.4, spot_noise_px=0.001)
-        one = meetings(1, 0, np.zeros(3), np.array([0.0, 0.0]), 0.0)
+        one = slice_poses(1, 0, np.zeros(3), np.array([0.0, 0.0]), 0.0)
         poses = one.take(np.zeros(1500, dtype=int))
         refusal = register_spots(np.zeros((0, 2)), frame, SCALE)
         given: list[np.ndarray] = []

@@ -17,7 +17,7 @@ from stereoreg_ros.frames.expected_error import (
     spot_covariances,
 )
 from stereoreg_ros.frames.layouts import Layouts
-from stereoreg_ros.frames.meeting import meetings
+from stereoreg_ros.frames.slice_poses import slice_poses
 from stereoreg_ros.geometry.pose import Pose, rotation_angle, rotation_exp
 from stereoreg_ros.geometry.projection import cut, cut_jacobian, project
 from stereoreg_ros.simulation import ScannerSettings
@@ -30,7 +30,7 @@ UPRIGHT = Imaging(SCALE, 0.3, 0.0)
 
 
 def level(count: int, tilt_deg: float = 30.0):
-    return meetings(count, 1, np.zeros(3), np.array([-8.0, 8.0]), tilt_deg)
+    return slice_poses(count, 1, np.zeros(3), np.array([-8.0, 8.0]), tilt_deg)
 
 
 def test_is_the_cramer_rao_bound() -> None:
@@ -181,7 +181,7 @@ class TestMeetings:
     def test_stay_within_their_ranges(self) -> None:
         nominal = rotation_exp(np.array([0.4, -0.2, 1.0]))
         middle = np.array([3.0, -4.0, 5.0])
-        poses = meetings(300, 5, middle, np.array([-12.0, 7.0]), 25.0, nominal, 40.0)
+        poses = slice_poses(300, 5, middle, np.array([-12.0, 7.0]), 25.0, nominal, 40.0)
         away = np.degrees(rotation_angle(poses.rotations @ nominal.T))
         assert away.max() <= 40 + 1e-9
         assert away.max() > 35
@@ -196,16 +196,16 @@ class TestMeetings:
 
     def test_no_direction_of_the_normal_is_met_more_often_than_another(self) -> None:
         """Of the cap of a sphere, the heights above its rim are all as frequent."""
-        poses = meetings(256, 5, np.zeros(3), np.array([0.0, 0.0]), 60.0)
+        poses = slice_poses(256, 5, np.zeros(3), np.array([0.0, 0.0]), 60.0)
         np.testing.assert_allclose(np.sort(poses.rotations[:, 2, 2]), 0.5 + (np.arange(256) + 0.5) / 512, atol=0.004)
 
     def test_any_turn_where_nothing_is_known(self) -> None:
-        poses = meetings(400, 5, np.zeros(3), np.array([0.0, 0.0]), 30.0)
+        poses = slice_poses(400, 5, np.zeros(3), np.array([0.0, 0.0]), 30.0)
         turns = np.arctan2(poses.rotations[:, 1, 0], poses.rotations[:, 0, 0])
         assert np.histogram(turns, 4, (-np.pi, np.pi))[0].min() > 60
 
     def test_seeded(self) -> None:
-        again = [meetings(8, seed, np.zeros(3), np.array([-1.0, 1.0]), 30.0).rotations for seed in (1, 1, 2)]
+        again = [slice_poses(8, seed, np.zeros(3), np.array([-1.0, 1.0]), 30.0).rotations for seed in (1, 1, 2)]
         np.testing.assert_array_equal(again[0], again[1])
         assert not np.allclose(again[0], again[2])
 

@@ -13,7 +13,7 @@ from stereoreg_ros import PixelScale, RegistrationOptions, load_frame
 from stereoreg_ros.frames.ambiguity import Trial
 from stereoreg_ros.frames.inspection import Inspection, _turned, inspect_frame
 from stereoreg_ros.frames.inspection_table import table_of
-from stereoreg_ros.frames.meeting import Meetings
+from stereoreg_ros.frames.slice_poses import SlicePoses
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import rotation_exp
 from stereoreg_ros.solvers.calibration import calibration_covariance
@@ -38,7 +38,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> dict[int | None, Trial]:
     outcomes: dict[int | None, Trial] = {}
 
     def trials(
-        _frame: Frame, poses: Meetings, _scale: object, _options: object, left_out: Sequence[int | None], _rng: object
+        _frame: Frame, poses: SlicePoses, _scale: object, _options: object, left_out: Sequence[int | None], _rng: object
     ) -> Iterator[Trial]:
         for _ in range(len(poses)):
             for out in left_out:

@@ -13,11 +13,11 @@ from joblib import parallel_config
 from stereoreg_ros import PixelScale, RegistrationOptions
 from stereoreg_ros.frames import design_search as search_module
 from stereoreg_ros.frames.ambiguity import Trial
-from stereoreg_ros.frames.design_search import Candidate, Wish, search
+from stereoreg_ros.frames.design_search import Candidate, Requirements, search
 from stereoreg_ros.frames.expected_error import Imaging
 from stereoreg_ros.frames.layouts import Envelope, Layouts
-from stereoreg_ros.frames.meeting import Meetings
 from stereoreg_ros.frames.proposal import Proposal, propose
+from stereoreg_ros.frames.slice_poses import SlicePoses
 from stereoreg_ros.geometry.pose import Array
 
 OPTIONS = RegistrationOptions(nominal_orientation=(1.0, 0.0, 0.0, 0.0), max_rotation_deg=20.0)
@@ -27,8 +27,8 @@ AMBIGUOUS, REFUSED = Trial(None, "ambiguous", True, ()), Trial(None, "no_consens
 CORNERS = np.array([0.1, 0.1, 0.3, 0.1, 0.9, 0.1, 0.9, 0.4, 0.9, 0.9, 0.6, 0.9, 0.1, 0.9, 0.1, 0.5])
 
 
-def wish(target_mm: tuple[float, float, float] = (0.0, 100.0, 0.0)) -> Wish:
-    return Wish(
+def requirements(target_mm: tuple[float, float, float] = (0.0, 100.0, 0.0)) -> Requirements:
+    return Requirements(
         Envelope((60.0, 60.0, 60.0), 5.0), (1.0,) * 4, Imaging(PixelScale(0.5, 0.5), 0.3, 1.0), target_mm, 30.0, 15.0
     )
 
@@ -40,15 +40,15 @@ class Search:
     candidates: list[list[Candidate]]
     outcomes: list[list[Trial]]
     seeds: list[int] = field(default_factory=list)
-    poses: list[Meetings] = field(default_factory=list)
+    poses: list[SlicePoses] = field(default_factory=list)
     left_out: list[Sequence[int | None]] = field(default_factory=list)
 
-    def search(self, _wish: Wish, seed: int, _chains: int, _tell: object) -> list[Candidate]:
+    def search(self, _wish: Requirements, seed: int, _chains: int, _tell: object) -> list[Candidate]:
         self.seeds.append(seed)
         return self.candidates[len(self.seeds) - 1]
 
     def trials(
-        self, _frame: Any, poses: Meetings, _scale: Any, _options: Any, left_out: Sequence[int | None], _rng: Any
+        self, _frame: Any, poses: SlicePoses, _scale: Any, _options: Any, left_out: Sequence[int | None], _rng: Any
     ) -> Iterator[Trial]:
         self.poses.append(poses)
         self.left_out.append(left_out)
@@ -64,7 +64,7 @@ def proposed(
     made = Search(candidates, outcomes)
     monkeypatch.setattr("stereoreg_ros.frames.proposal.search", made.search)
     monkeypatch.setattr("stereoreg_ros.frames.proposal.trials", made.trials)
-    return propose(wish(), "mine", OPTIONS, 5, 1, progress), made
+    return propose(requirements(), "mine", OPTIONS, 5, 1, progress), made
 
 
 def candidate(moved: float = 0.0, interrupted: bool = False) -> Candidate:
@@ -90,11 +90,13 @@ class TestProposal:
     ) -> None:
         found, _ = proposed(monkeypatch, [[candidate(0.0007)]], [[RIGHT]])
         assert found.frame.name == "mine"
-        exact = wish().envelope.layouts((CORNERS + 0.0007)[None], (1.0,) * 4)
+        exact = requirements().envelope.layouts((CORNERS + 0.0007)[None], (1.0,) * 4)
         np.testing.assert_allclose(found.frame.starts, np.round(exact.starts[0], 1))
         np.testing.assert_allclose(found.frame.ends, np.round(exact.ends[0], 1))
-        assert found.target_error_95_mm == pytest.approx(wish().target_errors(Layouts.of(found.frame))[0], rel=1e-12)
-        assert found.target_error_95_mm != pytest.approx(wish().target_errors(exact)[0], rel=1e-6)
+        assert found.target_error_95_mm == pytest.approx(
+            requirements().target_errors(Layouts.of(found.frame))[0], rel=1e-12
+        )
+        assert found.target_error_95_mm != pytest.approx(requirements().target_errors(exact)[0], rel=1e-6)
 
     @pytest.mark.parametrize("bad", [AMBIGUOUS, WRONG])
     def test_one_that_is_ambiguous_or_accepted_with_a_wrong_rod_gives_way_to_the_next(
@@ -136,22 +138,24 @@ def upright(distance_mm: float) -> Array:
 class TestSearch:
     def test_rods_keep_their_gap_when_their_ends_are_rounded(self) -> None:
         """5 mm and what rounding may take, between rods of 1 mm."""
-        can = wish().can_be_built(np.array([upright(distance) for distance in (5.9, 6.1, 6.2)]))
+        can = requirements().can_be_built(np.array([upright(distance) for distance in (5.9, 6.1, 6.2)]))
         assert can.tolist() == [False, False, True]
 
     def test_what_is_too_near_costs_by_its_square(self) -> None:
         costs, errors = (
             np.array([f(one) for one in (upright(4.0), upright(7.0))])
             for f in (
-                lambda corners: wish().costs(corners[None])[0],
-                lambda corners: wish().target_errors(wish().envelope.layouts(corners[None], (1.0,) * 4))[0],
+                lambda corners: requirements().costs(corners[None])[0],
+                lambda corners: requirements().target_errors(
+                    requirements().envelope.layouts(corners[None], (1.0,) * 4)
+                )[0],
             )
         )
         np.testing.assert_allclose(costs - errors, [2.2**2, 0.0], atol=1e-9)
 
     def test_the_error_is_that_of_the_target(self) -> None:
-        layouts = wish().envelope.layouts(CORNERS[None], (1.0,) * 4)
-        near, far = (wish(target).target_errors(layouts)[0] for target in ((0.0, 0.0, 0.0), (0.0, 300.0, 0.0)))
+        layouts = requirements().envelope.layouts(CORNERS[None], (1.0,) * 4)
+        near, far = (requirements(target).target_errors(layouts)[0] for target in ((0.0, 0.0, 0.0), (0.0, 300.0, 0.0)))
         assert far > 2 * near
 
     def test_the_best_that_can_be_built_comes_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,11 +164,11 @@ class TestSearch:
         found = {0: (CORNERS, 9.0), 1: (upright(4.0), 0.0), 2: (others[0], 0.0)}
         monkeypatch.setattr(search_module, "_chain", lambda _wish, seed: found[seed.spawn_key[-1]])
         with parallel_config(backend="sequential"):
-            candidates = search(wish(), seed=1, chains=3)
+            candidates = search(requirements(), seed=1, chains=3)
         errors = [one.target_error_95_mm for one in candidates]
         assert errors == sorted(errors)
-        layouts = wish().envelope.layouts(np.array([one.corners for one in candidates]), (1.0,) * 4)
-        np.testing.assert_allclose(wish().target_errors(layouts), errors)
-        assert wish().can_be_built(np.array([one.corners for one in candidates])).all()
+        layouts = requirements().envelope.layouts(np.array([one.corners for one in candidates]), (1.0,) * 4)
+        np.testing.assert_allclose(requirements().target_errors(layouts), errors)
+        assert requirements().can_be_built(np.array([one.corners for one in candidates])).all()
         assert any((one.corners == CORNERS).all() for one in candidates)
         assert not any(one.interrupted for one in candidates)

@@ -16,7 +16,7 @@ from stereoreg_ros.cli import design as design_command
 from stereoreg_ros.cli import main
 from stereoreg_ros.cli.parsing import INTERRUPTED
 from stereoreg_ros.dicom import read_series
-from stereoreg_ros.frames.design_search import Wish
+from stereoreg_ros.frames.design_search import Requirements
 from stereoreg_ros.frames.inspection import Inspection
 from stereoreg_ros.frames.layouts import Layouts
 from stereoreg_ros.frames.proposal import Proposal
@@ -80,8 +80,8 @@ def test_the_call_in_a_cubes_file_writes_that_file(name: str, tmp_path: Path, mo
     assert call
     assert tried
 
-    def found(wish: Wish, *_: object) -> Proposal:
-        return Proposal(frame, float(wish.target_errors(Layouts.of(frame))[0]), 0, int(tried[1]), False)
+    def found(requirements: Requirements, *_: object) -> Proposal:
+        return Proposal(frame, float(requirements.target_errors(Layouts.of(frame))[0]), 0, int(tried[1]), False)
 
     monkeypatch.setattr(design_command, "propose", found)
     monkeypatch.setattr(design_command, "inspected", stopped)

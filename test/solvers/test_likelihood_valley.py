@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereoreg_ros import PixelScale, RegistrationOptions, load_frame, register_spots
-from stereoreg_ros.frames.meeting import meetings
+from stereoreg_ros.frames.slice_poses import slice_poses
 from stereoreg_ros.geometry.frame import Frame
 from stereoreg_ros.geometry.pose import Array, Pose
 from stereoreg_ros.geometry.projection import project
@@ -89,7 +89,7 @@ def test_of_four_rods_it_is_the_mean_squared_error():
     along, at_bottom = [], []
     for seed in (100, 104, 105, 106):
         frame, rng = four_rods(seed), np.random.default_rng(seed)
-        poses = meetings(150, seed, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
+        poses = slice_poses(150, seed, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
         for row in range(len(poses)):
             true = poses.pose(row)
             spots_px, cuts = project(frame, true, SCALE)
@@ -115,7 +115,7 @@ def test_of_four_rods_it_is_the_mean_squared_error():
 def test_the_registration_states_it():
     """A pose of a four-rod frame at which the bottom of the valley tells too little."""
     frame, rng = four_rods(100), np.random.default_rng(3)
-    poses = meetings(60, 3, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
+    poses = slice_poses(60, 3, np.zeros(3), np.array([-10.0, 10.0]), 30.0)
     options = RegistrationOptions(
         frame_tolerance_mm=0.0,
         scale_tolerance=0.0,

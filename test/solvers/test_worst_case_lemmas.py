@@ -262,7 +262,7 @@ class TestResidual:
         # 0.4 mm are four standard deviations.
         assert length(_Beyond(np.array([0.4, 0.0, 0.0]), NOTHING, NOTHING)) == pytest.approx(math.hypot(7.0, 4.0))
         pulled = np.array([30.0, 0.0, 0.0])
-        yielded = np.array([model.gives_way(rows, pulled, NOTHING) for rows in model._jacobian]) / STD_MM
+        yielded = np.array([model.bound_by_residuals(rows, pulled, NOTHING) for rows in model._jacobian]) / STD_MM
         assert np.linalg.norm(yielded) > 0.1
         assert length(_Beyond(NOTHING, pulled, NOTHING)) == pytest.approx(5.0 + float(np.linalg.norm(yielded)))
 
@@ -301,7 +301,7 @@ class TestWhatThePoseDoes:
         force = 7.0 * step / np.linalg.norm(step)
         reached = abs(float(row @ model._inverse @ change.T @ force))
         by_slope = np.array([np.linalg.norm(step) * 7.0, 0.0, 0.0])
-        assert model.gives_way(row[None], by_slope, NOTHING) == pytest.approx(reached, rel=1e-6)
+        assert model.bound_by_residuals(row[None], by_slope, NOTHING) == pytest.approx(reached, rel=1e-6)
 
     def test_the_pose_gives_way_to_a_change_of_the_arm(self) -> None:
         model, row = self.ROD.model(), np.random.default_rng(5).normal(size=6)
@@ -312,16 +312,16 @@ class TestWhatThePoseDoes:
         force = np.cross(moment_row, arm_change)
         force *= 5.0 / np.linalg.norm(force)
         reached = abs(float(moment_row @ np.cross(arm_change, force)))
-        assert model.gives_way(row[None], NOTHING, np.array([0.0, 0.15, 0.0])) == pytest.approx(reached)
+        assert model.bound_by_residuals(row[None], NOTHING, np.array([0.0, 0.15, 0.0])) == pytest.approx(reached)
 
     def test_both_add_up_for_one_spot_and_in_squares_over_several(self) -> None:
         model, row = self.ROD.model(), np.random.default_rng(6).normal(size=(1, 6))
         slopes, arms = np.diag([0.3, 0.5, 0.2]), np.diag([0.02, 0.01, 0.05])
         each = [
-            model.gives_way(row, slope, NOTHING) + model.gives_way(row, NOTHING, arm)
+            model.bound_by_residuals(row, slope, NOTHING) + model.bound_by_residuals(row, NOTHING, arm)
             for slope, arm in zip(slopes, arms, strict=True)
         ]
-        together = model.gives_way(row, slopes.sum(axis=0), arms.sum(axis=0))
+        together = model.bound_by_residuals(row, slopes.sum(axis=0), arms.sum(axis=0))
         assert together == pytest.approx(float(np.linalg.norm(each)))
 
 

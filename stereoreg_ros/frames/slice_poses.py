@@ -16,7 +16,7 @@ MIDDLE_MM = (120.0, 120.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Meetings:
+class SlicePoses:
     """p poses slice_from_frame: rotations (p, 3, 3), translations (p, 3) mm; and how they came about.
 
     tilts_deg: (p,), between the slice's normal and the frame's z axis as it nominally stands; heights_mm: (p,), of the
@@ -31,16 +31,16 @@ class Meetings:
     def __len__(self) -> int:
         return len(self.rotations)
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Meetings:
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> SlicePoses:
         """Some of them."""
-        return Meetings(self.rotations[rows], self.translations[rows], self.tilts_deg[rows], self.heights_mm[rows])
+        return SlicePoses(self.rotations[rows], self.translations[rows], self.tilts_deg[rows], self.heights_mm[rows])
 
     def pose(self, row: int) -> Pose:
         """slice_from_frame of one of them."""
         return Pose(self.rotations[row], self.translations[row])
 
 
-def meetings(
+def slice_poses(
     count: int,
     seed: int,
     middle_mm: Array,
@@ -48,7 +48,7 @@ def meetings(
     largest_tilt_deg: float,
     nominal: Array | None = None,
     max_rotation_deg: float = 180.0,
-) -> Meetings:
+) -> SlicePoses:
     """`count` poses spread evenly (Sobol) over tilts up to `largest_tilt_deg`, turns about the normal, and heights.
 
     middle_mm: (3,), the frame's middle; heights_mm: (2,), from where to where the slice lies above it; nominal:
@@ -71,4 +71,4 @@ def meetings(
     rotations = turned @ tilted @ (np.eye(3) if nominal is None else nominal)
     heights = heights_mm[0] + shares[:, 3] * (heights_mm[1] - heights_mm[0])
     translations = np.column_stack([np.tile(MIDDLE_MM, (count, 1)), -heights]) - rotations @ middle_mm
-    return Meetings(rotations, translations, np.degrees(tilt), heights)
+    return SlicePoses(rotations, translations, np.degrees(tilt), heights)
