@@ -46,12 +46,13 @@ def _attempt(data: bytes) -> None:
 
 def _read_as_file(data: bytes) -> None:
     _file().write_bytes(data)
-    for slice_axes in (False, True):
-        try:
-            _check(read_slice(_file(), slice_axes=slice_axes))
-        except DicomError as error:
-            if not str(error).startswith(str(_file())):
-                raise AssertionError("a refusal does not name the file") from error
+    # One of the two ways, as an image over which its decoder hangs takes its time each time.
+    slice_axes = zlib.crc32(data) // _READ_ONCE_IN % 2 == 1
+    try:
+        _check(read_slice(_file(), slice_axes=slice_axes))
+    except DicomError as error:
+        if not str(error).startswith(str(_file())):
+            raise AssertionError("a refusal does not name the file") from error
 
 
 def _check(dicom_slice: DicomSlice) -> None:
