@@ -196,6 +196,15 @@ def test_a_target_given_in_the_new_axes_before_the_first_slice_of_them_is_kept(h
     assert here.outcomes[-2:] == [("registration", ""), ("target", "")]
 
 
+def test_under_another_frame_id_the_target_and_the_pose_before_are_dropped(here: NodeHere) -> None:
+    here.send("ct")
+    here.worker.finish()
+    here.target("ct")
+    here.send("room")
+    assert here.outcomes[-1] == ("target", "other_frame_of_reference")
+    assert here.worker.setups[-1].previous == (None,)
+
+
 def test_slices_in_the_same_axes_are_no_change(here: NodeHere) -> None:
     for reference in ("1.2.3", "1.2.3"):
         here.send(reference=reference)

@@ -39,6 +39,9 @@ from stereoreg_ros.solvers.maximum_likelihood import solve_maximum_likelihood
 from stereoreg_ros.solvers.pose_solution import PoseSolution
 from stereoreg_ros.uncertainty import cramer_rao_pose
 
+# The whole quick report is made for the first test that needs it, a minute by itself.
+pytestmark = pytest.mark.timeout(900)
+
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
