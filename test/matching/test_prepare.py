@@ -75,7 +75,7 @@ def test_the_node_goes_on_preparing_while_no_slice_comes(no_tables, monkeypatch)
     from support.ros_process import node_here
 
     monkeypatch.setattr(register_node, "_PREPARE_AT_START_S", 0.0)
-    monkeypatch.setattr(register_node, "_PREPARE_AT_ONCE_S", 0.0)
+    monkeypatch.setattr(register_node, "_SPARE_TIME_S", 0.001)
     with node_here(register_node.RegisterNode) as node:
         (output,) = node._outputs
         tables = output.registrar._matchers.by_levels.tables

@@ -566,7 +566,7 @@ def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
     with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_publish_statuses", lambda statuses, _header: published.extend(statuses))
         monkeypatch.setattr(node, "_worker", at_once)
-        monkeypatch.setattr(node, "_preparation", None)
+        monkeypatch.setattr(node, "_prepare_tables", lambda *_: None)
         node._begin(IncomingSlice(image_of(rendered(19)[0]), time.monotonic(), SCALE))
     (status,) = published
     assert values_of(status)["reason"] == "internal_error"

@@ -343,6 +343,7 @@ def test_a_skipped_slice_leaves_the_pose_before(monkeypatch):
     with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_diagnostics", SimpleNamespace(publish=told.append))
         monkeypatch.setattr(node, "_worker", at_once)
+        monkeypatch.setattr(node, "_prepare_tables", lambda *_: None)
         image = image_of(rendered(2)[0])
         image.header.frame_id = "ct"
         incoming = IncomingSlice(image, time.monotonic(), SCALE)

@@ -43,9 +43,9 @@ from stereoreg_ros.nodes.register.worker import Worker
 
 _REPORT_STREAM_S: Final = 1.0
 _REPEAT_WARNING_S: Final = 5.0
-# Before the node says that it is ready; the rest is prepared while no slice waits.
+# Before the node says that it is ready; the rest is prepared bit by bit while no slice waits.
 _PREPARE_AT_START_S: Final = 2.0
-_PREPARE_AT_ONCE_S: Final = 0.05
+_SPARE_TIME_S: Final = 0.2
 # Tables for one spacing serve those near it, so that they are worth preparing before one is known.
 _TYPICAL_SCALE: Final = PixelScale(0.5, 0.5)
 
@@ -68,8 +68,11 @@ class RegisterNode(Node):
         self._preparation: Iterator[None] | None = None
         self._prepared_for: PixelScale | None = None
         self._frame_fault = self._load_start_frames()
-        if self._preparation is not None:
-            _prepare(self._preparation, _PREPARE_AT_START_S)
+        if self._preparation is not None and self.settings.scale is not None:
+            end_s = time.monotonic() + _PREPARE_AT_START_S
+            for _ in self._preparation:
+                if time.monotonic() >= end_s:
+                    break
         self._backlog = Backlog()
         self._worker = Worker(self)
         self._registering = False
@@ -86,7 +89,9 @@ class RegisterNode(Node):
         self._pictures = Pictures(self)
         self._input = SliceInput(self, lambda: self.settings.slice_pose_required, self._on_slice)
         self._target = TargetKeeper(self, lambda: (self.settings, self._outputs), self._diagnose_now)
-        self.create_timer(_REPORT_STREAM_S, self._report_stream, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_REPORT_STREAM_S, self._report_stream, clock=steady)
+        self.create_timer(_SPARE_TIME_S, self._prepare_some, clock=steady)
         self._scale = ScaleKeeper(self, self)
         self._scale_services = ScaleServices(
             self, self._scale, lambda: (self.settings, self._frame_to_measure_with(), self._input.has_source)
@@ -94,7 +99,6 @@ class RegisterNode(Node):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._scale.load()
-        self._go_on()
         self.get_logger().info(f"ready, {self.settings.in_force}")
 
     def destroy_node(self) -> None:
@@ -109,14 +113,11 @@ class RegisterNode(Node):
         self._go_on()
 
     def _go_on(self) -> None:
-        """Begin with the slice whose turn it is, and prepare tables while none waits."""
+        """Begin with the slice whose turn it is."""
         for late in self._backlog.take_late(time.monotonic()):
             self._skip(late)
         while self._worker.is_free and (incoming := self._backlog.take()) is not None:
             self._begin(incoming)
-        if self._worker.is_free and self._preparation is not None:
-            tables = self._preparation
-            self._worker.submit(partial(_prepare, tables, _PREPARE_AT_ONCE_S), partial(self._on_prepared, tables))
 
     def _begin(self, incoming: IncomingSlice) -> None:
         """Refuse a slice that cannot be registered, or have the worker register it."""
@@ -306,8 +307,14 @@ class RegisterNode(Node):
         registrars = [output.registrar for output in self._outputs]
         self._preparation = chain.from_iterable(one.preparation(scale, options) for one in registrars)
 
-    def _on_prepared(self, tables: Iterator[None], done: bool) -> None:
-        if done and tables is self._preparation:
+    def _prepare_some(self) -> None:
+        """Fill some tables while no slice waits."""
+        if self._worker.is_free and self._preparation is not None:
+            tables = self._preparation
+            self._worker.submit(partial(next, tables, _DONE), partial(self._on_prepared, tables))
+
+    def _on_prepared(self, tables: Iterator[None], outcome: object) -> None:
+        if outcome is _DONE and tables is self._preparation:
             self._preparation = None
         self._go_on()
 
@@ -384,16 +391,11 @@ _OF_THE_TABLES: Final = {
     "max_rotation_deg",
     "min_inliers",
 }
+_DONE: Final = object()
 _NO_TF2: Final = "publish_tf is true, but tf2_ros cannot be imported, expected the package ros-jazzy-tf2-ros"
 _NO_SPACING: Final = (
     "pixel_spacing is not set, and the slice came without slice_spacing: set the parameter to [sx, sy] in mm/pixel"
 )
-
-
-def _prepare(tables: Iterator[None], seconds: float) -> bool:
-    """Fill tables for so long; returns whether all are filled."""
-    end_s = time.monotonic() + seconds
-    return all(time.monotonic() < end_s for _ in tables)
 
 
 def main() -> int:
