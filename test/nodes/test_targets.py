@@ -268,7 +268,7 @@ def test_after_a_refused_slice_no_target_rests_on_the_pose_before(bench, image, 
     target = bench.client.wait_for(lambda: of_stamp(bench.targets, last), "target_in_frame")
     in_frame = bench.pose(last).inverse() @ np.array([4.0, 5.0, 6.0])
     np.testing.assert_allclose(conversions.point_from_message(target), in_frame, atol=1e-6)
-    assert [one.header.stamp for one in bench.targets] == [first, last]
+    assert bench.stamps_of(bench.targets) == [first, last]
     bench.wait_told(4 if answers else 3)
     assert [reason for ((_, reason),) in bench.told()] == ["", *["no_pose"] * (1 + answers), ""]
 
@@ -277,7 +277,7 @@ def test_before_the_first_slice_there_is_no_pose_and_the_target_is_kept(bench):
     assert bench.reach([1.0, 2.0, 3.0]) == [("cube6", "no_pose")]
     stamp = bench.send(image_of(rendered(2)[0]))
     bench.client.wait_for(lambda: of_stamp(bench.targets, stamp), "target_in_frame")
-    assert [one.header.stamp for one in bench.targets] == [stamp]
+    assert bench.stamps_of(bench.targets) == [stamp]
 
 
 @pytest.mark.parametrize("change", [{"pixel_shear": 1e-4}, {"pixel_spacing": [1.0001 * SCALE.sx, SCALE.sy]}], ids=str)
@@ -289,7 +289,7 @@ def test_a_pose_of_another_spacing_is_none_to_rest_on(bench, change):
     assert bench.reach([1.0, 2.0, 3.0]) == [("cube6", "no_pose")]
     last = bench.send(image_of(rendered(2)[0]))
     bench.client.wait_for(lambda: of_stamp(bench.targets, last), "target_in_frame")
-    assert [one.header.stamp for one in bench.targets] == [first, last]
+    assert bench.stamps_of(bench.targets) == [first, last]
 
 
 def test_a_recalibration_ends_the_pose_before_and_so_does_the_way_back(bench):
@@ -308,7 +308,7 @@ def test_a_recalibration_ends_the_pose_before_and_so_does_the_way_back(bench):
     assert bench.reach([1.0, 2.0, 3.0]) == [("cube6", "no_pose")]
     last = bench.send(image)
     bench.client.wait_for(lambda: of_stamp(bench.targets, last), "target_in_frame")
-    assert [one.header.stamp for one in bench.targets] == [first, second, last]
+    assert bench.stamps_of(bench.targets) == [first, second, last]
 
 
 FAULTY = {
@@ -332,7 +332,7 @@ def test_a_faulty_target_ends_the_one_before_and_is_forgotten(bench, faulty):
     bench.client.wait_for(lambda: of_stamp(bench.targets, last), "target_in_frame")
     # None with the second pose, neither of the good target nor of the faulty one.
     assert [reason for ((_, reason),) in bench.told()] == ["", "bad_target", ""]
-    assert [one.header.stamp for one in bench.targets] == [first, last]
+    assert bench.stamps_of(bench.targets) == [first, last]
 
 
 def test_a_skipped_slice_leaves_the_pose_before(monkeypatch):
