@@ -36,6 +36,7 @@ class Stand:
         )
         self.warnings: list[str] = []
         self.refuses = ""
+        self.changes = 0
         self.keeper = ScaleKeeper(cast("Any", self), cast("Any", self))
 
     def get_logger(self) -> Any:
@@ -49,6 +50,9 @@ class Stand:
         self.settings.scale = PixelScale(sx, sy, values["pixel_shear"])
         assert self.keeper.sets_it_itself, "the keeper's own change is no configuration"
         return SetParametersResult(successful=True)
+
+    def scale_changed(self) -> None:
+        self.changes += 1
 
     def configure(self, scale: PixelScale) -> None:
         """As somebody sets the parameters."""
@@ -177,6 +181,15 @@ def test_a_measured_scale_that_cannot_be_set_is_not_used(tmp_path: Path) -> None
     stand.keeper.add(sighting())
     assert stand.keeper.take(calibration(), FRAME) == (False, "the measured scale cannot be set: no")
     assert stand.in_use() == (CONFIGURED, "configured")
+
+
+def test_going_back_where_nothing_was_configured_is_a_change_that_no_parameter_shows(tmp_path: Path) -> None:
+    stand = Stand(None, saved(tmp_path / "scale.yaml"))
+    stand.keeper.load()
+    assert (stand.in_use(CONFIGURED), stand.changes) == ((MEASURED, "measured"), 0)
+    assert stand.keeper.reset() == (True, "slices are registered with the pixel spacing that they state")
+    assert (stand.in_use(CONFIGURED), stand.changes) == ((CONFIGURED, "configured"), 1)
+    assert stand.settings.scale is None
 
 
 def test_nothing_to_go_back_to() -> None:

@@ -107,6 +107,18 @@ def test_a_limit_that_is_set_meanwhile_holds_for_the_slice_under_way(here: NodeH
     assert here.outcomes == [("registration", "inaccurate")]
 
 
+def test_a_scale_that_no_parameter_shows_counts_for_the_slice_under_way_and_the_pose_before(here: NodeHere) -> None:
+    here.send()
+    here.worker.finish()
+    here.send()
+    here.node.scale_changed()
+    here.worker.finish()
+    assert here.outcomes == [("registration", "")]
+    assert here.worker.setups[-1].previous == (None,)
+    here.target()
+    assert here.outcomes[1:] == [("target", "no_pose")]
+
+
 def test_a_slice_is_registered_again_with_the_frame_that_is_set_meanwhile(here: NodeHere) -> None:
     here.send()
     here.set(frame_file="cube5")

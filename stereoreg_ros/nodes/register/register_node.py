@@ -360,6 +360,11 @@ class RegisterNode(Node):
         if self._worker.is_free:
             self._go_on()
 
+    def scale_changed(self) -> None:
+        """Slices are registered with another scale from now on: no target may rest on a pose of the one before."""
+        self._revision += 1
+        self._forget_poses()
+
     def _apply_scale(self, before: PixelScale | None) -> None:
         if self._scale.sets_it_itself:
             # It was measured from slices that are there, which say the same as before; a pose of theirs does not.

@@ -39,10 +39,11 @@ class ScaleInUse:
 
 
 class _Registering(Protocol):
-    """What the keeper asks of the node."""
+    """What the keeper asks of the node: its settings, and to take note of a scale that no parameter shows."""
 
     @property
     def settings(self) -> NodeSettings: ...
+    def scale_changed(self) -> None: ...
 
 
 class ScaleKeeper:
@@ -166,6 +167,7 @@ class ScaleKeeper:
                 return False, f"calibration_file {path} cannot be removed: {error.strerror}; nothing was changed"
         self._record = None
         if scale is None:
+            self._registering.scale_changed()
             return True, "slices are registered with the pixel spacing that they state"
         fault = self._set(scale)
         return not fault, fault or f"pixel_spacing is the configured one, [{scale.sx:.9g}, {scale.sy:.9g}] mm/pixel"
