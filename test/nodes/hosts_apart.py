@@ -244,7 +244,8 @@ def test_the_host_of_register_node_is_cut_off(system):
     assert stamps == sorted(stamps)
     site.wait_for_poses(send(site, scanner, 3))
     assert site.pose_age_s < CUT_S / 2
-    assert max(grown.values()) < 2048
+    # register_node fills its tables meanwhile.
+    assert grown["receive_dicom_node"] < 2048
 
 
 def test_the_host_of_the_controller_is_cut_off(system):

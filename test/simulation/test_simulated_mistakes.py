@@ -91,7 +91,7 @@ def test_the_same_seed_gives_the_same_scene(kind: str) -> None:
     first, again, other = (GENERATORS[kind](np.random.default_rng(seed), frame, around("cube6")) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.spots_px, again.spots_px)
     np.testing.assert_array_equal(first.rods, again.rods)
-    assert first.frame is again.frame, "tables are kept by frame"
+    assert first.frame == again.frame
     assert first.spots_px.shape != other.spots_px.shape or not np.allclose(first.spots_px, other.spots_px)
 
 
