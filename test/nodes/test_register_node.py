@@ -562,7 +562,7 @@ def test_internal_error_is_refused_and_reported(monkeypatch, capfd):
 
     monkeypatch.setattr(slice_registration, "register_frames", broken)
     published: list[DiagnosticStatus] = []
-    at_once = SimpleNamespace(is_free=True, submit=lambda work, then: then(work()))
+    at_once = SimpleNamespace(is_free=True, submit=lambda work, then: then(work()), close=lambda: None)
     with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_publish_statuses", lambda statuses, _header: published.extend(statuses))
         monkeypatch.setattr(node, "_worker", at_once)

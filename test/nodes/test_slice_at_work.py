@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -39,6 +40,9 @@ class ManualWorker:
     def submit(self, work: Callable[[], Any], then: Callable[[Any], None]) -> None:
         self._waiting.append((work, then))
         self.setups += [one for one in getattr(work, "args", ()) if isinstance(one, SliceSetup)]
+
+    def close(self) -> None:
+        """Nothing to end."""
 
     def finish(self) -> None:
         work, then = self._waiting.pop(0)
@@ -240,7 +244,7 @@ def hard_slice() -> np.ndarray:
 def test_the_node_answers_while_it_searches_a_hard_slice() -> None:
     """By the order of what comes: the answer of a service and of a target before that of the slice."""
     arguments = ["-r", "__ns:=/hard", "-p", f"pixel_spacing:=[{SCALE.sx},{SCALE.sy}]", "-p", "frame_file:=cube8"]
-    with RosClient("console") as client, node_process("register_node", "--ros-args", *arguments):
+    with RosClient("console") as client, node_process("register_node", "--ros-args", *arguments) as process:
         bench = Bench(client, "/hard", "/hard/image")
         bench.warm_up(bench.diagnostics)
         client.get_parameters(bench.node, "threshold")
@@ -263,3 +267,9 @@ def test_the_node_answers_while_it_searches_a_hard_slice() -> None:
         )
         assert of_stamp(bench.diagnostics, stamp) is None, "the slice was no hard one"
         bench.status(stamp)
+        # Nor does a search keep it from ending, or make it end otherwise than it should.
+        bench.diagnostics.clear()
+        bench.send(image_of(hard_slice()))
+        client.wait_for(is_under_way, "a status of the stream with the slice under way")
+        code, _ = process.stop(signal.SIGTERM)
+        assert code == 0

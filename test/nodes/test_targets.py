@@ -339,7 +339,7 @@ def test_a_skipped_slice_leaves_the_pose_before(monkeypatch):
     """It says nothing of the frame, and the next slice is waiting."""
     told: list[DiagnosticArray] = []
     monkeypatch.setattr(register_node, "_PREPARE_AT_START_S", 0.0)
-    at_once = SimpleNamespace(is_free=True, submit=lambda work, then: then(work()))
+    at_once = SimpleNamespace(is_free=True, submit=lambda work, then: then(work()), close=lambda: None)
     with node_here(register_node.RegisterNode) as node:
         monkeypatch.setattr(node, "_diagnostics", SimpleNamespace(publish=told.append))
         monkeypatch.setattr(node, "_worker", at_once)

@@ -85,6 +85,22 @@ def test_an_error_of_the_work_is_one_of_the_callback_and_the_next_work_is_done()
     assert worker.is_free
 
 
+def test_closed_it_ends_once_its_work_is_done() -> None:
+    node = Callbacks()
+    idle = Worker(node)  # type: ignore[arg-type]
+    idle.close()
+    assert not idle.is_running
+    busy = Worker(node)  # type: ignore[arg-type]
+    hold = threading.Event()
+    busy.submit(lambda: hold.wait(60.0), lambda _: None)
+    busy.close()
+    assert busy.is_running
+    hold.set()
+    node.serve()
+    busy._thread.join(60.0)
+    assert not busy.is_running
+
+
 def test_triggers_that_count_as_one_leave_no_result_behind() -> None:
     node = Callbacks()
     worker = Worker(node)  # type: ignore[arg-type]

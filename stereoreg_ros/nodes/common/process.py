@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -21,6 +22,7 @@ _WAKE_S = 0.2
 def run(node_factory: Callable[[], Node], threads: int = 1) -> int:
     """Run a node until a signal ends the process or the node's own `finished` (if it has one) is true.
 
+    Where the node's `is_computing` (if it has one) is true then, the process ends without waiting for that.
     threads: for the callbacks; more than one where a callback of a group of its own waits for something.
     A callback that fails is reported with its traceback and the node lives on.
     Returns the exit code: 0, or 1 with a sentence on standard error where the node cannot start.
@@ -47,6 +49,11 @@ def run(node_factory: Callable[[], Node], threads: int = 1) -> int:
             raise
     finally:
         _end(node)
+    if getattr(node, "is_computing", False):
+        # The interpreter would end such a thread in the middle of C++ code, and that the whole process by an abort.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
     return 0
 
 

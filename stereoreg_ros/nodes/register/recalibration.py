@@ -56,6 +56,11 @@ class Recalibration:
             return None
         return self._refusal if now_s >= self._deadline_s else None
 
+    @property
+    def is_measuring(self) -> bool:
+        """Whether its thread is at work."""
+        return self._attempt is not None and not self._attempt.done()
+
     def close(self) -> None:
         """Have a measurement that goes on end early; nobody waits for it."""
         self._closed = True

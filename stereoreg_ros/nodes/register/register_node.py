@@ -104,7 +104,13 @@ class RegisterNode(Node):
     def destroy_node(self) -> None:
         """End; a recalibration that goes on is refused."""
         self._scale_services.close()
+        self._worker.close()
         super().destroy_node()
+
+    @property
+    def is_computing(self) -> bool:
+        """Whether a thread of the node is at work, which nothing can stop."""
+        return self._worker.is_running or self._scale_services.is_measuring
 
     # From a slice to a pose, in the order of the data.
 

@@ -34,6 +34,7 @@ class ScaleServices:
     ) -> None:
         self._node, self._keeper, self._state = node, keeper, state
         self._recalibration: Recalibration | None = None
+        self._last: Recalibration | None = None
         # Held by the call that waits: a second one that waited would take the node's last thread.
         self._called = threading.Lock()
         self._answer: Future[tuple[bool, str]] = Future()
@@ -49,6 +50,11 @@ class ScaleServices:
         """Answer a call that waits: the node ends."""
         self._closed = True
         self._end(*_ENDING)
+
+    @property
+    def is_measuring(self) -> bool:
+        """Whether a measurement is at work, be it one that nobody waits for any more."""
+        return any(one is not None and one.is_measuring for one in (self._recalibration, self._last))
 
     def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self._called.acquire(blocking=False):
@@ -98,7 +104,7 @@ class ScaleServices:
     def _end(self, success: bool, message: str) -> None:
         if self._recalibration is not None:
             self._recalibration.close()
-            self._recalibration = None
+            self._last, self._recalibration = self._recalibration, None
             self._poll.cancel()
         if not self._answer.done():
             self._answer.set_result((success, message))
