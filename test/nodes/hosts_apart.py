@@ -107,6 +107,21 @@ class Site:
         """Of slices, that the controller has heard, each with its stamp."""
         return [(seconds(one.header), one.status[0]) for one in self.diagnostics if one.status[0].name == STATUS_NAME]
 
+    def wait_until_prepared(self) -> None:
+        """Until register_node has filled its tables: while it does, its memory grows for no other reason."""
+        samples = [memory_kib(self.register.pid)[0]]
+        sampled_s = time.monotonic()
+
+        def at_rest() -> bool:
+            nonlocal sampled_s
+            if time.monotonic() >= sampled_s + 2.0:
+                samples.append(memory_kib(self.register.pid)[0])
+                sampled_s = time.monotonic()
+            # Six seconds in which a busy machine would have let it fill some.
+            return len(samples) >= 4 and max(samples[-4:]) - min(samples[-4:]) < 128
+
+        self.controller.wait_for(at_rest, "the tables of register_node", 250.0)
+
     @property
     def pose_age_s(self) -> float:
         """What a controller has to look at before it moves."""
@@ -209,6 +224,7 @@ def test_poses_come_over_the_network_and_a_console_is_served(system):
 def test_the_host_of_register_node_is_cut_off(system):
     """What the scanner was told is stored waits for it, what would not fit is refused, and the pose grows old."""
     site, scanner = system
+    site.wait_until_prepared()
     site.wait_for_poses(send(site, scanner, 4))
     site.network.pull_cable(REGISTERING)
     cut_s, poses = time.time(), len(site.poses)
@@ -244,13 +260,13 @@ def test_the_host_of_register_node_is_cut_off(system):
     assert stamps == sorted(stamps)
     site.wait_for_poses(send(site, scanner, 3))
     assert site.pose_age_s < CUT_S / 2
-    # register_node fills its tables meanwhile.
-    assert grown["receive_dicom_node"] < 2048
+    assert max(grown.values()) < 2048
 
 
 def test_the_host_of_the_controller_is_cut_off(system):
     """The others go on; the newest pose is there as soon as the cable is, and not all those before."""
     site, scanner = system
+    site.wait_until_prepared()
     site.wait_for_poses(send(site, scanner, 4))
     heard, poses = len(site.statuses()), len(site.poses)
     site.network.pull_cable(CONTROL)
