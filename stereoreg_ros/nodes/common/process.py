@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Callable
 
 import rclpy
-from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
@@ -19,11 +19,10 @@ from stereoreg_ros.nodes.common.parameters import ParameterError
 _WAKE_S = 0.2
 
 
-def run(node_factory: Callable[[], Node], threads: int = 1) -> int:
+def run(node_factory: Callable[[], Node]) -> int:
     """Run a node until a signal ends the process or the node's own `finished` (if it has one) is true.
 
     Where the node's `is_computing` (if it has one) is true then, the process ends without waiting for that.
-    threads: for the callbacks; more than one where a callback of a group of its own waits for something.
     A callback that fails is reported with its traceback and the node lives on.
     Returns the exit code: 0, or 1 with a sentence on standard error where the node cannot start.
     """
@@ -35,7 +34,7 @@ def run(node_factory: Callable[[], Node], threads: int = 1) -> int:
         return _cannot_start(error)
     node: Node | None = None
     try:
-        executor = SingleThreadedExecutor() if threads == 1 else MultiThreadedExecutor(threads)
+        executor = SingleThreadedExecutor()
         node = node_factory()
         require_declared(node)
         _spin(executor, node)
@@ -57,7 +56,7 @@ def run(node_factory: Callable[[], Node], threads: int = 1) -> int:
     return 0
 
 
-def _spin(executor: Executor, node: Node) -> None:
+def _spin(executor: SingleThreadedExecutor, node: Node) -> None:
     executor.add_node(node)
     while rclpy.ok() and not getattr(node, "finished", False):
         try:

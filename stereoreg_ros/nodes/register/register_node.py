@@ -411,7 +411,7 @@ _NO_SPACING: Final = (
 
 def main() -> int:
     """Entry point of `register_node`."""
-    return run(RegisterNode, threads=2)
+    return run(RegisterNode)
 
 
 if __name__ == "__main__":

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from typing import Final
 
@@ -20,11 +19,12 @@ from stereoreg_ros.nodes.register.recalibration import Recalibration
 from stereoreg_ros.nodes.register.scale_keeper import ScaleKeeper
 
 _POLL_S: Final = 0.05
+_PAUSE_S: Final = 0.002
 _ENDING: Final = (False, "calibration refused: the node is ending")
 
 
 class ScaleServices:
-    """Recalibration goes on beside the slices: one call waits in a thread of its own, all else is done in the node's.
+    """Recalibration goes on beside the slices: the call waits over many turns of the node's callbacks.
 
     state: the settings, the frame to measure with (None where none could be loaded), and whether anybody sends slices.
     """
@@ -35,20 +35,15 @@ class ScaleServices:
         self._node, self._keeper, self._state = node, keeper, state
         self._recalibration: Recalibration | None = None
         self._last: Recalibration | None = None
-        # Held by the call that waits: a second one that waited would take the node's last thread.
-        self._called = threading.Lock()
         self._answer: Future[tuple[bool, str]] = Future()
-        self._closed = False
-        self._wake = node.create_guard_condition(self._begin)
         self._poll = node.create_timer(_POLL_S, self._go_on, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._poll.cancel()
-        own_threads = ReentrantCallbackGroup()
-        node.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=own_threads)
+        # A call goes on over many turns of the executor, and must keep neither slices nor other calls from theirs.
+        node.create_service(Trigger, "~/recalibrate", self._on_recalibrate, callback_group=ReentrantCallbackGroup())
         node.create_service(Trigger, "~/reset_calibration", self._on_reset_calibration)
 
     def close(self) -> None:
         """Answer a call that waits: the node ends."""
-        self._closed = True
         self._end(*_ENDING)
 
     @property
@@ -56,18 +51,18 @@ class ScaleServices:
         """Whether a measurement is at work, be it one that nobody waits for any more."""
         return any(one is not None and one.is_measuring for one in (self._recalibration, self._last))
 
-    def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not self._called.acquire(blocking=False):
+    async def _on_recalibrate(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._recalibration is not None:
             response.success, response.message = False, "a recalibration is running already, wait for its answer"
             return response
-        try:
-            self._answer = Future()
-            self._wake.trigger()
-            if self._closed:
-                self._end(*_ENDING)
-            response.success, response.message = self._answer.result()
-        finally:
-            self._called.release()
+        answer: Future[tuple[bool, str]] = Future()
+        self._answer = answer
+        self._begin()
+        while not answer.done():
+            # rclpy asks again without a pause, and the thread that measures needs the interpreter.
+            time.sleep(_PAUSE_S)
+            await _NextTurn()
+        response.success, response.message = answer.result()
         return response
 
     def _begin(self) -> None:
@@ -115,3 +110,10 @@ class ScaleServices:
         else:
             response.success, response.message = self._keeper.reset()
         return response
+
+
+class _NextTurn:
+    """Awaited by a callback that lets others have their turn first."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
