@@ -34,7 +34,7 @@ _SCALE_IMPLAUSIBLE = 5e-3
 # Log-likelihood by which unmatched spots beside rods that have none, and a poor fit, may speak for a mistake: one slice
 # in a thousand is taken not to be as it was described.
 _MOST_EVIDENCE = math.log(1000.0)
-# Poses whose rotations differ by less cannot be told apart by a nominal orientation.
+# A nominal orientation cannot distinguish poses whose rotations differ by less.
 _SAME_ORIENTATION_DEG = 10.0
 # Of several poses, how many a sentence lists.
 _LISTED = 8
@@ -151,7 +151,7 @@ def _nothing_found(case: Case) -> Verdict | None:
     nothing = f"no pose puts {min(fewest, case.rods)} of the {case.rods} rods on any of the {case.spots} spots"
     if fewest <= case.problem.min_inliers:
         return Verdict("no_consensus", nothing)
-    fewer = f"{fewest - 1} rods could hardly be told from chance among that many spots"
+    fewer = f"{fewest - 1} rods could hardly be distinguished from chance among that many spots"
     return Verdict("no_consensus", f"{nothing}, and {fewer}" if fewest <= case.rods else fewer)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,18 +28,7 @@ Reason = Literal[
     "skipped",
     "internal_error",
 ]
-REASONS: Final[tuple[Reason, ...]] = (
-    "too_few_spots",
-    "no_consensus",
-    "ambiguous",
-    "degenerate",
-    "inaccurate",
-    "contradicted",
-    "bad_image",
-    "bad_frame",
-    "skipped",
-    "internal_error",
-)
+REASONS: Final[tuple[Reason, ...]] = get_args(Reason)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Prints the answer of register_node to each slice: the pose, or the reason why there is none."""
+"""Prints what register_node answers to each slice: the pose, or why the slice was refused."""
 
 from __future__ import annotations
 

@@ -25,8 +25,6 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=2.0, help="slices per second (default 2)")
     arguments = parser.parse_args()
     series = read_series(arguments.series)
-    if not series.headers[0].has_plane:
-        parser.error(f"{arguments.series} has no position and orientation, so slice_pose is unknown")
     types = get_typestore(Stores.ROS2_JAZZY)
     begin_ns = time.time_ns()
     with Writer(arguments.bag, version=9, storage_plugin=StoragePlugin.MCAP) as bag:

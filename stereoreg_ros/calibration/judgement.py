@@ -25,7 +25,7 @@ _LEAST_FREEDOM = 4
 _IMPLAUSIBLE = 1e-6
 # Standard deviations by which the change of sx must differ from that of sy before the frame's size explains neither.
 _APART = 3.0
-_NOT_TOLD_APART = "Scale and size of the frame cannot be told apart from slices"
+_SCALE_OR_SIZE = "Slices cannot distinguish the scale from the size of the frame"
 
 
 def judge(found: Explained, previous: PixelScale, calibration: CalibrationOptions) -> Calibration | CalibrationRefusal:
@@ -44,7 +44,7 @@ def judge(found: Explained, previous: PixelScale, calibration: CalibrationOption
         return CalibrationRefusal(
             f"calibration refused: scanner, or frame file? The pixel spacing that {origin} is ({reference.sx:.4f}, "
             f"{reference.sy:.4f}) mm/pixel, the one measured is {measured}: {100 * change:.1f} % off, more than "
-            f"{100 * limit:.3g} %; if the first is right, the frame {size}. {_NOT_TOLD_APART}, and {of_frame}; measure "
+            f"{100 * limit:.3g} %; if the first is right, the frame {size}. {_SCALE_OR_SIZE}, and {of_frame}; measure "
             "the frame, or set calibration_max_change to allow such a change"
         )
     slices = len(found.matched)
@@ -53,7 +53,7 @@ def judge(found: Explained, previous: PixelScale, calibration: CalibrationOption
     message = (
         f"pixel spacing changed from ({previous.sx:.4f}, {previous.sy:.4f}) to {measured}{shear} from {slices} "
         f"slice{'s' if slices > 1 else ''} with {found.rods} rods; residual {before:.3f} pixel before, {after:.3f} "
-        f"pixel after; {of_frame}. {_NOT_TOLD_APART}: if ({reference.sx:.4f}, {reference.sy:.4f}) is right, the frame "
+        f"pixel after; {of_frame}. {_SCALE_OR_SIZE}: if ({reference.sx:.4f}, {reference.sy:.4f}) is right, the frame "
         f"{size}"
     )
     at = found.joint.at

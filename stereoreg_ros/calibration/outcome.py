@@ -1,4 +1,4 @@
-"""What a calibration comes to: a scale, or why there is none."""
+"""The outcome of a calibration: a scale, or a refusal with its reason."""
 
 from __future__ import annotations
 

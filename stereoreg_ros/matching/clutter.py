@@ -27,7 +27,7 @@ _HALF_LINE_MM: Final = 0.75
 # How far the pieces of a spot lie from each other, mm per axis; shares of the unmatched spots that may be pieces.
 _PIECE_MM: Final = 2.0
 _PIECE_SHARES: Final = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-# Pitches of a square lattice that are looked for, mm; a finer one cannot be told from no lattice at all.
+# Pitches of a square lattice that are looked for, mm; a finer one cannot be distinguished from uniform clutter.
 _FINEST_MM, _COARSEST_MM = 2.5, 25.0
 # Steps of wave number, as phases over the spots' extent; how far, as a share of the pitch, a spot may be off a hole.
 _PHASE_STEP, _OFF_HOLE = 0.4, 0.12

@@ -82,7 +82,7 @@ class LevelSearch:
         return self._log10_false_alarms[hypothesis]
 
     def hopeless(self, level: int) -> bool:
-        """Whether even a true match of `level` rods could hardly be told from chance."""
+        """Whether even a true match of `level` rods could hardly be distinguished from chance."""
         return self.least_false_alarms(level) > self.problem.max_log10_false_alarms
 
     def least_false_alarms(self, level: int) -> float:

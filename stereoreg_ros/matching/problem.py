@@ -18,7 +18,7 @@ from stereoreg_ros.matching.spots import Spots, Streaks
 from stereoreg_ros.matching.tolerances import Tolerances
 from stereoreg_ros.options import RegistrationOptions
 
-# Explanations are never held to be told apart by less than this many decades of likelihood.
+# Explanations that differ by fewer decades of likelihood are never taken to be distinguishable.
 _LEAST_DECADES_APART: Final = 1.0
 
 
@@ -65,7 +65,7 @@ class Problem:
 
     @property
     def decades_apart(self) -> float:
-        """By how many decades of likelihood explanations must differ to count as told apart.
+        """By how many decades of likelihood explanations must differ to be distinguishable.
 
         Half of those by which chance must be ruled out, a thousand to one by default: who wants more certainty of the
         one kind wants more of the other.

@@ -36,7 +36,7 @@ SCANNER = ScannerSettings(scale=TRUE)
 NOISE_PX = 0.25
 OPTIONS = RegistrationOptions(spot_noise_px=NOISE_PX)
 EXACT_FRAME = replace(OPTIONS, frame_tolerance_mm=0.0)
-NOT_TOLD_APART = "Scale and size of the frame cannot be told apart from slices"
+SCALE_OR_SIZE = "Slices cannot distinguish the scale from the size of the frame"
 
 
 def seen(spots_px: np.ndarray, stated: PixelScale | None = None) -> SliceSpots:
@@ -165,7 +165,7 @@ class TestAccepted:
         assert "from 3 slices with 18 rods" in found.message
         by_x, by_y = found.frame_errors
         assert f"rod ends known to 0.2 mm contribute {by_x:.4f} and {by_y:.4f} to the errors" in found.message
-        assert NOT_TOLD_APART in found.message
+        assert SCALE_OR_SIZE in found.message
         assert found.residual_after_px < found.residual_before_px
 
 
@@ -226,7 +226,7 @@ class TestWhereTheSpacingCameFrom:
             assert "scanner, or frame file?" in refusal.message
             assert "that came with the slices is (0.5000, 0.4800) mm/pixel, the one measured is (0.4" in refusal.message
             assert "more than 0.5 %" in refusal.message
-            assert NOT_TOLD_APART in refusal.message
+            assert SCALE_OR_SIZE in refusal.message
             assert "calibration_max_change" in refusal.message
             size = re.search(r"the frame would have to be (\d\.\d) % larger than its file says", refusal.message)
             assert size is not None, refusal.message
@@ -249,7 +249,7 @@ class TestWhereTheSpacingCameFrom:
         taken = slices_of(np.random.default_rng(33), grown(cube, self.LARGE), 5)
         found = calibrate(taken, cube, TRUE, OPTIONS)
         assert isinstance(found, Calibration), found.message
-        assert NOT_TOLD_APART in found.message
+        assert SCALE_OR_SIZE in found.message
         assert re.search(r"if \(0.5000, 0.4800\) is right, the frame would have to be [23]\.\d % larger", found.message)
 
     def test_a_small_change_is_made(self, cube: Frame) -> None:

@@ -224,8 +224,12 @@ class TestNothingFound:
         ("least_rods", "told"),
         [
             (4, r"^no pose puts 4 of the 6 rods on any of the 9 spots$"),
-            (5, r"^no pose puts 5 of the 6 rods on any of the 9 spots, and 4 rods could hardly be told from chance"),
-            (7, r"^6 rods could hardly be told from chance among that many spots$"),
+            (
+                5,
+                r"^no pose puts 5 of the 6 rods on any of the 9 spots, "
+                r"and 4 rods could hardly be distinguished from chance",
+            ),
+            (7, r"^6 rods could hardly be distinguished from chance among that many spots$"),
         ],
     )
     def test_says_how_far_was_searched(self, least_rods: int, told: str) -> None:
