@@ -56,9 +56,9 @@ class ByLevels:
         Where nothing is found, the search ends where a match of so few rods could hardly be distinguished from chance.
         Where something is found, it goes on as long as an explanation of fewer rods, if it fits well, could come near:
         among the spots of the best explanation, as twins of a pose share them, and among all spots where chance may
-        bring one that could be accepted. What was found is looked at once more from further triples of rods, for twins that one
-        triple may have missed: see docs/matching.md for how many of the poses a triple of rods finds. Where nothing
-        acceptable was found, further triples are tried too: the spots of the first may lie in a line.
+        bring one that could be accepted. What was found is looked at once more from further triples of rods, for twins
+        that one triple may have missed: see docs/matching.md for how many of the poses a triple of rods finds. Where
+        nothing acceptable was found, further triples are tried too: the spots of the first may lie in a line.
         """
         spots, frame = problem.spots, problem.frame
         gains, apart = problem.gains, problem.decades_apart
